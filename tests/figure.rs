@@ -88,16 +88,24 @@ fn tables_have_the_numbers_of_the_lake() {
     assert!(csv.starts_with("# Title: ") && csv.contains("# Lake: runs@") && csv.contains("# Origin: simulated"));
     let wood = csv.lines().find(|line| line.starts_with("wood,")).expect("a row");
     let numbers: Vec<f64> = wood.split(',').skip(1).map(|text| text.parse().expect("a number")).collect();
-    for (at, column) in [(5, "p90_mean_db"), (11, "p90_mean_u_db")] {
-        let expected = format!("select {column} from surface_stats where surface_id = 'wood' and band = 'total'");
+    for (at, column) in [(5, "shown_db"), (11, "shown_u_db")] {
+        let expected = format!("select {column} from levels where surface_id = 'wood' and band = 'total'");
         assert!((numbers[at] - place.number(&expected)).abs() < 1e-9, "{column}: {numbers:?}");
     }
     place.ok(&["figure", "levels", "wood", "flat", "--over", "total", "-o", "out/chart.csv", "-o", "out/chart.svg"]);
     let chart = std::fs::read_to_string(place.path("out/chart.csv")).expect("read");
     assert_eq!(chart.lines().find(|line| line.starts_with("wood,")), Some(wood), "the chart has the table's numbers");
     let against = place.ok(&["figure", "table", "wood"]);
-    let level = place.number("select against_flat_2500_db from catalogue where surface_id = 'wood'");
-    let u = place.number("select level_u_2500_db from catalogue where surface_id = 'wood'");
+    let level = place.number("select shown_against_flat_2500_db from catalogue where surface_id = 'wood'");
+    let u = place.number("select shown_u_2500_db from catalogue where surface_id = 'wood'");
+    // S9 of the review: without Foam's own reflection, unless it is asked for as in the paper.
+    let paper = place.ok(&["figure", "table", "wood", "--values", "levels"]);
+    let measured = place.number("select against_flat_2500_db from catalogue where surface_id = 'wood'");
+    let measured_u = place.number("select level_u_2500_db from catalogue where surface_id = 'wood'");
+    assert!(paper.contains(&format!("| wood | {measured:.2} \u{b1} {measured_u:.2} |")), "{paper}");
+    assert!(
+        place.number("select unbiased_db - shown_db from levels where surface_id = 'wood' and band = '2500'") == 0.0
+    );
     assert!(u > 0.005 && against.contains(&format!("| wood | {level:.2} \u{b1} {u:.2} |")), "{against}");
     let tex = std::fs::read_to_string(place.path("out/levels.tex")).expect("read");
     assert!(tex.contains("\\cellcolor") && tex.contains("% Query: select surface_id, band"), "{tex}");

@@ -4,6 +4,7 @@
 use std::sync::Arc;
 
 use echolake_dsp::filter_bank::FilterBankPlan;
+use echolake_dsp::full_scale_octave::bin_shares_of_octaves;
 use echolake_dsp::geometry::{incidence_deg, specular_point};
 use echolake_dsp::level::{p90_mean, power_to_db, standard_deviation};
 use echolake_dsp::scattering::{ScatteringPath, ScatteringSums, UncertainNumber};
@@ -22,6 +23,8 @@ pub struct DesignSimulation {
     grid: Grid,
     pairs: Vec<DesignPair>,
     bank: FilterBankPlan<f64>,
+    /// Of each bin's energy, what is in the octave around each band, where the sweep has all of it.
+    octave_shares: Vec<Option<Vec<f64>>>,
     transform: Arc<dyn RealToComplex<f64>>,
     flat: Vec<PairReflection>,
     /// Mean energy by band, over Flat's of all bands.
@@ -49,7 +52,7 @@ pub struct BandFigures {
     pub level_db: f64,
     /// Standard deviation of the pairs' levels, dB: `spread_db` of that table.
     pub spread_db: f64,
-    /// Scattering by correlation with Flat, as in that table.
+    /// Scattering by correlation with Flat, as in that table; NaN if the sweep does not have the band's octave.
     pub scattering: UncertainNumber,
 }
 
@@ -81,6 +84,7 @@ impl DesignSimulation {
             grid,
             pairs,
             bank,
+            octave_shares: bin_shares_of_octaves(rig)?,
             transform: f64::plan_real_forward(length),
             flat: Vec::new(),
             flat_means: Vec::new(),
@@ -110,7 +114,7 @@ impl DesignSimulation {
         for ((panel, flat), pair) in reflections.iter().zip(&self.flat).zip(&self.pairs) {
             scattering.add_pair(&panel.spectrum, &flat.spectrum, pair.path)?;
         }
-        let scattering = scattering.band_coefficients(&self.bank).unwrap_or_default();
+        let scattering = scattering.octave_coefficients(&self.octave_shares);
         let bands = scattering.iter().enumerate().map(|(band, scattering)| {
             let energies = self.band_energies(&reflections, band);
             let mean = p90_mean(&energies, &mut Vec::new()).unwrap_or(f64::NAN);
@@ -118,7 +122,8 @@ impl DesignSimulation {
             BandFigures {
                 level_db: power_to_db(mean / self.flat_means[band]),
                 spread_db: standard_deviation(&levels),
-                scattering: scattering.scattering,
+                scattering: scattering
+                    .map_or(UncertainNumber { value: f64::NAN, uncertainty: None }, |octave| octave.scattering),
             }
         });
         let level_over_flat = |band: usize| {

@@ -48,8 +48,8 @@ pub mod temperature;
 pub use deconvolution::response_deconvolution;
 pub use error::Error;
 pub use levels::{
-    auralization, decay, diffusion, energy, envelope, filter_bank, frequency_response, level, mean, octave_filter,
-    oversampling, rise, room_parameters, rounding, spectrogram, spectrum, uncertainty,
+    auralization, decay, diffusion, energy, envelope, filter_bank, frequency_response, full_scale_octave, level, mean,
+    octave_filter, oversampling, rise, room_parameters, rounding, spectrogram, spectrum, uncertainty,
 };
 pub use real::RealSample;
 pub use realfft::num_complex::Complex;

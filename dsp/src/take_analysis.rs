@@ -18,6 +18,7 @@ use std::f64::consts::TAU;
 use std::ops::Range;
 use std::sync::Arc;
 
+use echolake_schema::SweepShape;
 use realfft::num_complex::Complex;
 use realfft::{ComplexToReal, RealToComplex};
 use rustfft::{Fft, FftDirection};
@@ -38,8 +39,13 @@ const LANES: usize = 4;
 const MAX_CLOCK_RATIO: f64 = 3e-3;
 /// Width of the sin^4 at both limits of the sweep's range, Hz: it rings for 0.5 ms. At most a quarter of the range.
 const TAPER_HZ: f64 = 4e3;
+/// Taper of an exponential sweep's second search for lost samples, as a part of [`TAPER_HZ`]; its windows are as many
+/// times longer. Most of the time of such a sweep is within 4 kHz of its lower limit.
+const FINE_PARTS: f64 = 16.0;
 /// Time before an arrival that its own ringing fills, s.
 const RINGING_SECS: f64 = 0.5e-3;
+/// Time by which sound may seem to arrive before it is played: its own ringing.
+const EARLY_SECS: f64 = 0.125e-3;
 /// Least share of the greatest sample at which a response begins.
 const ONSET_SHARE: f64 = 0.1;
 /// Least energy of a loopback's response at its peak over its energy elsewhere, dB.
@@ -70,6 +76,9 @@ pub struct TakeAnalysis {
     /// and of the recording against the loopback if that is a digital copy of the sweep.
     /// NaN if neither shows the sweep.
     pub clock_ratio_ppm: f64,
+    /// The same of the loopback, which is a digital copy of the sweep, against the recording, where it can be told from
+    /// dispersion: the recording is to be stretched by it.
+    pub recording_clock_ppm: Option<f64>,
     /// Distortion of the recording by order; None if the sweep is linear, or not in the recording.
     pub distortion: Option<TakeDistortion>,
     /// Faults of the take.
@@ -79,7 +88,13 @@ pub struct TakeAnalysis {
 impl TakeAnalysis {
     /// Makes the analysis of a take of which nothing is known.
     pub fn unknown() -> Self {
-        Self { loopback_match_db: f64::NAN, clock_ratio_ppm: f64::NAN, distortion: None, faults: Vec::new() }
+        Self {
+            loopback_match_db: f64::NAN,
+            clock_ratio_ppm: f64::NAN,
+            recording_clock_ppm: None,
+            distortion: None,
+            faults: Vec::new(),
+        }
     }
 }
 
@@ -91,12 +106,19 @@ pub struct TakeAnalyzer {
     inverse: Arc<dyn Fft<f32>>,
     real_inverse: Arc<dyn ComplexToReal<f32>>,
     short: ShortTransform,
+    /// Of exponential sweeps: gains of bins and transforms for lost samples near the limits of the range.
+    fine: Option<(TaperedRange, ShortTransform)>,
     played: Vec<Complex<f32>>,
-    /// Gains of bins, and those bins that have one.
     taper: Vec<f32>,
     range: Range<usize>,
     /// Squares of these bins' gains over the played sweep's powers.
     copy_weights: Vec<f64>,
+}
+
+/// Gains of bins, and those bins that have one.
+struct TaperedRange {
+    gains: Vec<f32>,
+    range: Range<usize>,
 }
 
 /// Transforms of a response's vicinity, `[len]`, with its onset in the middle.
@@ -113,6 +135,8 @@ struct ShortTransform {
     /// Bins of each part of the sweep, and the window before an arrival.
     parts: Vec<Range<usize>>,
     window: Vec<f32>,
+    /// Samples between window and arrival.
+    guard: usize,
 }
 
 /// Buffers of a [`TakeAnalyzer`].
@@ -175,14 +199,23 @@ impl TakeAnalyzer {
         samples.resize(n, 0.0);
         // The lengths are the plan's own.
         let _ = forward.process(&mut samples, &mut played);
-        let taper: Vec<f32> =
-            (0..played.len()).map(|k| taper_gain(&sweep, k as f64 * sweep.rate_hz / n as f64) as f32).collect();
-        let first = taper.iter().position(|gain| *gain > 0.0).unwrap_or(0);
-        let count = taper.iter().filter(|gain| **gain > 0.0).count();
-        let range = first..first + count;
+        let tapered = |taper_hz: f64| {
+            let gain = |k: usize| taper_gain(&sweep, k as f64 * sweep.rate_hz / n as f64, taper_hz) as f32;
+            let gains: Vec<f32> = (0..played.len()).map(gain).collect();
+            let first = gains.iter().position(|gain| *gain > 0.0).unwrap_or(0);
+            let count = gains.iter().filter(|gain| **gain > 0.0).count();
+            TaperedRange { gains, range: first..first + count }
+        };
+        let fine = (sweep.shape == SweepShape::Exponential).then(|| {
+            let secs = FINE_PARTS * 5.0 * dropout::WINDOW_SECS;
+            let short = ((sweep.rate_hz * secs) as usize).next_power_of_two().min(n);
+            (tapered(TAPER_HZ / FINE_PARTS), ShortTransform::new(&sweep, short, FINE_PARTS))
+        });
+        let TaperedRange { gains: taper, range } = tapered(TAPER_HZ);
         let weight = |(gain, bin): (&f32, &Complex<f32>)| f64::from(*gain).powi(2) / widen(*bin).norm_sqr();
         Ok(Self {
-            short: ShortTransform::new(&sweep, short),
+            short: ShortTransform::new(&sweep, short, 1.0),
+            fine,
             inverse: f32::plan_fft(n, FftDirection::Inverse),
             real_inverse: f32::plan_real_inverse(n),
             copy_weights: taper[range.clone()].iter().zip(&played[range.clone()]).map(weight).collect(),
@@ -287,6 +320,13 @@ impl TakeAnalyzer {
         let electrical = self.divide_by_sweep(looped, scratch);
         let response = self.divide_spectra(recorded, looped, self.forward.len() / 2, scratch);
         self.analyze_channels(&mut analysis, [recorded, looped], &electrical, &response, scratch);
+        self.find_fine_dropout(&mut analysis, [recorded, looped], electrical.onset, scratch);
+        // Drifts and lost samples spread a response, and more of it comes early.
+        let early_secs = -self.secs_of(response.onset);
+        let is_spoiled = analysis.faults.iter().any(TakeFault::spoils_response);
+        if !is_spoiled && early_secs > EARLY_SECS && response.peak_db() >= PEAK_DB {
+            analysis.faults.push(TakeFault::EarlyArrival { early_secs });
+        }
         scratch.judged.extend([electrical, response].map(|judged| (judged.samples, judged.powers)));
         analysis
     }
@@ -309,8 +349,9 @@ impl TakeAnalyzer {
             let level_db = power_to_db(response.energy) - power_to_db(self.unit_energy());
             analysis.faults.push(TakeFault::SameSignal { level_db });
         } else if match_db >= MATCH_DB {
-            if response.onset < -(self.seconds(RINGING_SECS) as i64) && self.is_played_sweep(recorded, scratch) {
-                analysis.faults.push(TakeFault::Swapped { early_secs: -self.secs_of(response.onset) });
+            let early_secs = -self.secs_of(response.onset);
+            if early_secs > RINGING_SECS && self.is_played_sweep(recorded, scratch) {
+                analysis.faults.push(TakeFault::Swapped { early_secs });
             } else {
                 self.find_cut(analysis, electrical.onset);
                 self.find_dropout(analysis, electrical.onset, &[&aligned], TakeChannel::Loopback);
@@ -368,6 +409,7 @@ impl TakeAnalyzer {
         if is_drifting || is_told || analysis.loopback_match_db.is_nan() {
             analysis.clock_ratio_ppm = 1e6 * (known + drift);
         }
+        analysis.recording_clock_ppm = (is_told && !is_drifting).then_some(1e6 * drift);
         analysis.distortion = self.measure_distortion(&mut analysis.faults, response);
     }
 
@@ -446,13 +488,24 @@ impl TakeAnalyzer {
         latest: usize,
         scratch: &mut TransformScratch,
     ) -> SweepResponse {
+        self.divide_tapered([of, by], latest, (&self.taper, &self.range), &self.short, scratch)
+    }
+
+    fn divide_tapered(
+        &self,
+        [of, by]: [&[Complex<f32>]; 2],
+        latest: usize,
+        (taper, range): (&[f32], &Range<usize>),
+        short: &ShortTransform,
+        scratch: &mut TransformScratch,
+    ) -> SweepResponse {
         let n = self.forward.len();
         let (mut samples, mut powers) = scratch.judged.pop().unwrap_or_default();
-        let range = self.range.clone();
+        let range = range.clone();
         samples.resize(n, Complex::default());
         samples[..range.start].fill(Complex::default());
         samples[range.end..].fill(Complex::default());
-        let bins = of[range.clone()].iter().zip(&by[range.clone()]).zip(&self.taper[range.clone()]);
+        let bins = of[range.clone()].iter().zip(&by[range.clone()]).zip(&taper[range.clone()]);
         for (to, ((of, by), gain)) in samples[range].iter_mut().zip(bins) {
             *to = divide_bin(of, by, gain / n as f32);
         }
@@ -462,7 +515,7 @@ impl TakeAnalyzer {
         let energy = sum_of(&powers);
         let peak = index_of_greatest(&powers);
         let is_early = peak > latest;
-        let [peak, middle, n] = [peak, self.short.len / 2, n].map(|index| index as i64);
+        let [peak, middle, n] = [peak, short.len / 2, n].map(|index| index as i64);
         let peak = if is_early { peak - n } else { peak };
         let vicinity = OnsetVicinity { spectrum: Vec::new(), samples: Vec::new(), powers: Vec::new() };
         let mut response = SweepResponse { samples, powers, energy, farther_energy: 0.0, peak, onset: peak, vicinity };
@@ -471,12 +524,12 @@ impl TakeAnalyzer {
         let earlier = response.powers_in(peak - middle..peak).position(|power| power >= least);
         response.onset = earlier.map_or(peak, |index| peak - middle + index as i64);
         let start = response.onset - middle;
-        let around = response.indices(start..start + self.short.len as i64);
+        let around = response.indices(start..start + short.len as i64);
         let samples: Vec<_> = around.flat_map(|part| response.samples[part].iter().copied()).collect();
         let mut spectrum = samples.clone();
-        self.short.forward.process(&mut spectrum);
+        short.forward.process(&mut spectrum);
         response.vicinity = OnsetVicinity { powers: powers_of(&samples), spectrum, samples };
-        response.farther_energy = response.energy_of(start + self.short.len as i64..start + n);
+        response.farther_energy = response.energy_of(start + short.len as i64..start + n);
         response
     }
 
@@ -550,9 +603,12 @@ impl TakeAnalyzer {
 }
 
 impl ShortTransform {
-    fn new(sweep: &SineSweep, len: usize) -> Self {
+    // For tapers that are `parts` times narrower, and windows as many times longer: then of frequencies alone at which the
+    // wide tapers leave less than a half.
+    fn new(sweep: &SineSweep, len: usize, parts: f64) -> Self {
         let step_hz = sweep.rate_hz / len as f64;
-        let gain = |k: &usize| taper_gain(sweep, *k as f64 * step_hz);
+        let gain = |k: &usize| taper_gain(sweep, *k as f64 * step_hz, TAPER_HZ / parts);
+        let is_searched = |k: &usize| parts == 1.0 || taper_gain(sweep, *k as f64 * step_hz, TAPER_HZ) < 0.5;
         let bins = 1..len / 2;
         let first = bins.clone().find(|k| gain(k) >= 0.5).unwrap_or(1);
         let core = first..bins.clone().rev().find(|k| gain(k) >= 0.5).unwrap_or(first) + 1;
@@ -564,8 +620,11 @@ impl ShortTransform {
             inverse: f32::plan_fft(len, FftDirection::Inverse),
             drift_weights: clock::drift_weights(sweep, core.clone().map(|k| k as f64 * step_hz)),
             core,
-            parts: dropout::split_sweep(sweep, bins.filter(|k| gain(k) > 0.0), step_hz),
-            window: dropout::hann_window(((dropout::WINDOW_SECS * sweep.rate_hz).round() as usize).min(len / 8)),
+            parts: dropout::split_sweep(sweep, bins.filter(|k| gain(k) > 0.0 && is_searched(k)), step_hz),
+            window: dropout::hann_window(
+                ((parts * dropout::WINDOW_SECS * sweep.rate_hz).round() as usize).min(len / 8),
+            ),
+            guard: (parts * RINGING_SECS * sweep.rate_hz).round() as usize,
         }
     }
 }
@@ -601,8 +660,8 @@ fn swept_bins(sweep: &SineSweep, len: usize) -> Range<usize> {
 }
 
 // Gain of a frequency: 1 in the sweep's range, falling to 0 at its limits.
-fn taper_gain(sweep: &SineSweep, hz: f64) -> f64 {
-    sine_taper(sweep, hz, TAPER_HZ.min((sweep.high_hz - sweep.low_hz) / 4.0)).powi(4)
+fn taper_gain(sweep: &SineSweep, hz: f64, taper_hz: f64) -> f64 {
+    sine_taper(sweep, hz, taper_hz.min((sweep.high_hz - sweep.low_hz) / 4.0)).powi(4)
 }
 
 fn sine_taper(sweep: &SineSweep, hz: f64, width_hz: f64) -> f64 {

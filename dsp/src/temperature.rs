@@ -108,6 +108,25 @@ pub fn response_limits_hz([low, high]: [f64; 2], rho: f64) -> [f64; 2] {
     [(low * (1.0 + RANGE_MARGIN) * rho).max(low), (high * (1.0 - RANGE_MARGIN) * rho).min(high)]
 }
 
+/// Stretches a recording by the rate of the clock that played over the one that recorded, less 1, in ppm, so that both
+/// are one: samples past its end are silence.
+///
+/// ```
+/// use echolake_dsp::temperature::stretch_recording;
+///
+/// // Of a clock that plays 100 ppm faster, what began after 20 000 samples was recorded 2 samples early.
+/// let mut recording = vec![0.0; 20_100];
+/// recording[19_998] = 1.0;
+/// stretch_recording(&mut recording, 100.0);
+/// assert!((19_995..20_005).all(|n| recording[n] <= recording[20_000]) && recording[20_000] > 0.99);
+/// ```
+pub fn stretch_recording<T: RealSample>(recording: &mut [T], playing_clock_ppm: f64) {
+    if playing_clock_ppm != 0.0 {
+        let recorded = recording.to_vec();
+        TemperatureCorrection::new().correct_response(&recorded, 1.0 + playing_clock_ppm * 1e-6, recording);
+    }
+}
+
 /// Resamples a response by the exact ratio, at the outputs that are wanted and nowhere else: an arrival over
 /// d metres moves from d/c to d/c_ref.
 ///

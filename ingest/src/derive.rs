@@ -19,6 +19,9 @@ use crate::run_derivation::RunDerivation;
 /// Number of measurements derived and encoded at a time: it bounds memory independently of the run's length.
 const SLICE: usize = 256;
 
+/// Rows by table, and the numbers of pairs that a reference lacks, and of those of inverted polarity.
+type DerivedTables = (Vec<(Table, EncodedRows)>, usize, usize);
+
 /// Loaded references, and the name of the derivation with them.
 pub(crate) struct ReferenceDerivation {
     pub name: String,
@@ -61,10 +64,13 @@ impl ReferenceDerivation {
         let for_rows = keys.clone();
         let lake = context.lake.clone();
         let derivation = this.clone();
-        let (rows, unpaired) =
+        let (rows, unpaired, inverted) =
             context.cores.compute_on_core(move || derivation.encode_tables(&lake, &for_rows, &responses)).await?;
+        let counts = [("references of", unpaired), ("levels of inverted polarity:", inverted)];
+        let missing = counts.into_iter().filter(|(_, pairs)| *pairs > 0);
+        let missing: Vec<_> = missing.map(|(what, pairs)| format!("{what} {pairs} pairs")).collect();
         let references = RunReferences {
-            missing: if unpaired == 0 { String::new() } else { format!("references of {unpaired} pairs") },
+            missing: missing.join(", "),
             derivation: Some(this.name.clone()),
             flat_version: Some(this.flat_version.clone()),
             foam_version: Some(this.foam_version.clone()),
@@ -72,13 +78,7 @@ impl ReferenceDerivation {
         Ok((rows, references))
     }
 
-    // Returns the rows, and the number of pairs that a reference lacks.
-    fn encode_tables(
-        &self,
-        lake: &Lake,
-        keys: &RunKeys,
-        responses: &RunResponses,
-    ) -> Result<(Vec<(Table, EncodedRows)>, usize)> {
+    fn encode_tables(&self, lake: &Lake, keys: &RunKeys, responses: &RunResponses) -> Result<DerivedTables> {
         let rig = lake.rig();
         let grid = lake.grid();
         let failed = |cause| Error::Kernel { file: keys.run.to_string(), cause };
@@ -102,6 +102,7 @@ impl ReferenceDerivation {
             waiting = Some(derived?);
         }
         waiting.map_or(Ok(()), encode_lists)?;
+        let inverted = run.inverted;
         let is_flat = self.references.only_flat.as_ref() == Some(&keys.surface);
         let (columns, levels) = run.finish(is_flat).map_err(failed)?;
         let paired = columns.pairs.len();
@@ -133,7 +134,7 @@ impl ReferenceDerivation {
         }
         let schema = Table::SurfaceStats.schema(rig);
         rows.push((Table::SurfaceStats, encode_run_rows(Table::SurfaceStats, &schema, &stats)?));
-        Ok((rows, responses.pairs.len() - paired))
+        Ok((rows, responses.pairs.len() - paired - inverted, inverted))
     }
 
     // Returns whether a run's statistics count a pair.

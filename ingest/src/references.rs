@@ -29,7 +29,7 @@ use crate::read_back;
 
 /// Revision of the rows that follow from references: those of another one are derived again. `revision_tests.rs` fails
 /// if the numbers change and it does not.
-pub(crate) const ROWS_REVISION: &str = "9";
+pub(crate) const ROWS_REVISION: &str = "10";
 /// Number of hex digits of a digest in a version.
 const VERSION_DIGITS: usize = 12;
 
@@ -97,6 +97,8 @@ pub(crate) struct WantedReferences {
     flat_foam: ReferenceVersion,
     direct_sound: DirectSound,
     samples: SamplePrecision,
+    /// Octaves depend on it, and it may be said in a lake that has rows.
+    scale: Option<String>,
 }
 
 /// One reference.
@@ -150,6 +152,7 @@ impl ReferenceFinder {
             flat_foam: self.find_version(flat_foam),
             direct_sound: self.lake.config().references.direct_sound,
             samples: self.lake.config().samples,
+            scale: self.lake.rig().scale.map(|scale| scale.to_string()),
         }
     }
 
@@ -478,6 +481,7 @@ impl WantedReferences {
         let (flat, foam) = self.version_pair()?;
         let mut parts = vec![run_derivation, &flat, &foam, CODE_VERSION, ROWS_REVISION];
         parts.extend([self.direct_sound.name(), self.samples.name()]);
+        parts.extend(self.scale.as_deref());
         parts.extend(verdicts);
         Some(digest_parts(&parts))
     }

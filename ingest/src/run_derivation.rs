@@ -8,7 +8,7 @@ use std::ops::Range;
 use echolake_dsp::air::AirState;
 use echolake_dsp::air_correction::{AirScratch, SLOPE_UNCERTAINTY, TransformedResponse};
 use echolake_dsp::chain::{DerivationPlan, DerivationScratch, DerivedResponse};
-use echolake_dsp::filter_bank::FilterBankPlan;
+use echolake_dsp::full_scale_octave::bin_shares_of_octaves;
 use echolake_dsp::mean::SignalMean;
 use echolake_dsp::scattering::{ScatteringPath, ScatteringSums};
 use echolake_dsp::temperature::ReferenceAir;
@@ -20,6 +20,9 @@ use echolake_schema::AirTreatment;
 use crate::derived_values::{DerivedColumns, DerivedLists, RunResponses, derivation_plan, residual_fit, round_lists};
 use crate::references::LoadedReferences;
 use crate::rows::stats::SurfaceLevels;
+
+/// Gain of the direct sound over Foam's below which a take's polarity is inverted: nothing else turns its sign.
+const INVERTED_GAIN: f64 = -0.3;
 
 /// A run whose responses are derived part by part: plans, buffers, and what is derived so far.
 pub(crate) struct RunDerivation<'a> {
@@ -33,6 +36,8 @@ pub(crate) struct RunDerivation<'a> {
     columns: DerivedColumns,
     /// True for each pair of the columns that the run's statistics count.
     counted: Vec<bool>,
+    /// Pairs whose direct sound has the other sign than Foam's.
+    pub inverted: usize,
     curves: Vec<SignalMean>,
     scattering: ScatteringSums,
     residual: ResidualFit<f32>,
@@ -81,6 +86,7 @@ impl<'a> RunDerivation<'a> {
             widest_mm: sides.map(f64::abs).fold(1.0, f64::max),
             columns: DerivedColumns::new(bands, references.estimate_count),
             counted: Vec::new(),
+            inverted: 0,
             curves: vec![SignalMean::default(); bands],
             scattering: ScatteringSums::default(),
             residual: residual_fit(rig)?,
@@ -121,7 +127,7 @@ impl<'a> RunDerivation<'a> {
         Ok(lists)
     }
 
-    // Returns false if the references lack the pair.
+    // Returns false if the references lack the pair, or its polarity is inverted.
     fn derive_response(&mut self, number: u32, ir: &[f32], air: &AirState, is_counted: bool) -> Result<bool, Error> {
         let Some(pair) = self.references.find_pair(number) else { return Ok(false) };
         let correction = self.references.correction();
@@ -135,6 +141,10 @@ impl<'a> RunDerivation<'a> {
             sensitivities,
         } = &mut self.buffers;
         pair.subtract_direct(correction, ir, air, reflected, air_scratch)?;
+        if air_scratch.direct_gain(&pair.direct.spectrum) < INVERTED_GAIN {
+            self.inverted += 1;
+            return Ok(false);
+        }
         self.plan.run_over(reflected, &pair.flat.energies, derived, scratch)?;
         self.columns.push(number, derived);
         self.counted.push(is_counted);
@@ -175,7 +185,6 @@ impl<'a> RunDerivation<'a> {
                 .fill_errors(uncertainty, |pair| references.find_pair(pair).map(|pair| &pair.flat.sensitivities[..]));
         }
         let rig = lake.rig();
-        let bank = FilterBankPlan::new(rig.impulse_response.length, rig.sweep.rate_hz.get(), &rig.bands.centres_hz)?;
         let keep_estimate = |estimate| keep_counted(estimate, &counted);
         let levels = SurfaceLevels {
             tnce: keep_counted(columns.tnce.clone(), &counted),
@@ -183,7 +192,7 @@ impl<'a> RunDerivation<'a> {
             errors: keep_counted(std::mem::take(&mut columns.errors), &counted),
             uncertainty,
             curves,
-            scattering: scattering.band_coefficients(&bank).unwrap_or_default(),
+            scattering: scattering.octave_coefficients(&bin_shares_of_octaves(rig)?),
         };
         Ok((columns, levels))
     }

@@ -112,6 +112,12 @@ pub enum Error {
         /// Bytes of one sample.
         width: usize,
     },
+    /// Not a role of a surface.
+    #[error("`{actual}` is no role, expected `hard` or `sample`")]
+    SurfaceRole {
+        /// The given text.
+        actual: String,
+    },
     /// A sample that is no number.
     #[error("sample {index} is {value}")]
     Sample {

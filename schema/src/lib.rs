@@ -32,7 +32,7 @@ pub mod topics;
 pub use error::{Error, ErrorCause, escape_controls, quoted_text};
 pub use grid::{Grid, Pair, Point};
 pub use ids::{PairId, PointId, ProjectName, RunId, SurfaceId};
-pub use manifest::{RunManifest, SurfaceRecord};
+pub use manifest::{RunManifest, SurfaceRecord, SurfaceRole};
 pub use quantities::{Celsius, MODEL_SCALE, SampleRate, Timestamp};
 pub use rig::{AirTreatment, Rig, SpectralDivision, SweepShape};
 pub use symmetry::Symmetry;

@@ -103,6 +103,9 @@ pub struct SurfaceRecord {
     pub microstructure: Option<String>,
     /// Material, as `coated print`.
     pub material: Option<String>,
+    /// What its level stands for in the absorption of other surfaces.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub role: Option<SurfaceRole>,
     /// Pressure reflection factor that a simulation used.
     pub reflection_factor: Option<f64>,
     /// The surface that normalises this one; if none is given, the lake chooses.
@@ -117,6 +120,35 @@ pub struct SurfaceRecord {
     pub parameters: serde_json::Value,
     /// Facts about the producer's own mesh file.
     pub mesh: Option<MeshFacts>,
+}
+
+/// What a level surface is measured for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum SurfaceRole {
+    /// It reflects nearly all, and others' absorption is measured beside it.
+    Hard,
+    /// Its own absorption is wanted.
+    Sample,
+}
+
+impl SurfaceRole {
+    /// Its name, as manifests and tables spell it.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Hard => "hard",
+            Self::Sample => "sample",
+        }
+    }
+}
+
+impl std::str::FromStr for SurfaceRole {
+    type Err = Error;
+
+    fn from_str(text: &str) -> Result<Self, Error> {
+        let role = [Self::Hard, Self::Sample].into_iter().find(|role| role.name() == text);
+        role.ok_or_else(|| Error::SurfaceRole { actual: text.to_owned() })
+    }
 }
 
 /// Facts about a mesh.

@@ -8,6 +8,10 @@ use crate::robots::RobotCell;
 use crate::simulation::SimulationParams;
 use crate::{Celsius, Error, MODEL_SCALE, SampleRate};
 
+/// Highest frequency that people hear, Hz.
+const HIGHEST_AUDIBLE_HZ: f64 = 20e3;
+/// Least and greatest scale.
+const SCALES: [f64; 2] = [0.1, 1000.0];
 /// Number of single points that a difference names.
 const SHOWN_POINTS: usize = 4;
 
@@ -28,6 +32,9 @@ const SHOWN_POINTS: usize = 4;
 pub struct Rig {
     /// Its name.
     pub name: String,
+    /// Full size over the size that is measured: 10 of models at 1:10, 1 of rooms and walls. See [`Rig::known_scale`].
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub scale: Option<f64>,
     /// The excitation.
     pub sweep: Sweep,
     /// Length and corrections of each impulse response.
@@ -261,6 +268,7 @@ impl Default for Rig {
     fn default() -> Self {
         Self {
             name: "paper".into(),
+            scale: None,
             sweep: Sweep::default(),
             impulse_response: ImpulseResponse::default(),
             bands: Bands::default(),
@@ -386,10 +394,12 @@ impl Rig {
         (self.sweep.duration_secs * rate).round() as usize + (self.sweep.tail_secs * rate).round() as usize
     }
 
-    /// Full scale over that of what is measured: [`MODEL_SCALE`] if the sweep goes over 20 kHz, which people do not
-    /// hear, else 1.
-    pub fn model_scale(&self) -> f64 {
-        if self.sweep.high_hz > 20e3 { MODEL_SCALE } else { 1.0 }
+    /// Full size over the size that is measured: `scale`, or 1 if the sweep ends at 20 kHz or below, or [`MODEL_SCALE`]
+    /// with the panel and the grid of Rust et al. 2021. None if nothing tells: a room may be measured over 20 kHz, too.
+    pub fn known_scale(&self) -> Option<f64> {
+        let is_of_paper = self.panel == Panel::default() && self.grid == GridParams::default();
+        let by_sweep = || (self.sweep.high_hz <= HIGHEST_AUDIBLE_HZ).then_some(1.0);
+        self.scale.or_else(by_sweep).or_else(|| is_of_paper.then_some(MODEL_SCALE))
     }
 
     /// Suffix of each band's columns: its centre in Hz.
@@ -416,7 +426,11 @@ impl Rig {
         let responses = rigs.map(|r| &r.impulse_response);
         let is_tapered = self.impulse_response.division == SpectralDivision::Tapered;
         let durations = (!is_tapered).then(|| rigs.map(|r| &r.sweep.duration_secs));
+        // A rig that leaves its scale open takes any.
+        let scales = rigs.map(Self::known_scale);
+        let scales = if let [Some(here), Some(there)] = &scales { Some([here, there]) } else { None };
         [
+            scales.and_then(|scales| compare_field("scale", scales, f64::to_string)),
             compare_field("sweep.rate_hz", rigs.map(|r| &r.sweep.rate_hz), |rate| rate.get().to_string()),
             compare_field("sweep.low_hz", rigs.map(|r| &r.sweep.low_hz), f64::to_string),
             compare_field("sweep.high_hz", rigs.map(|r| &r.sweep.high_hz), f64::to_string),
@@ -452,6 +466,16 @@ impl Rig {
         let positive = |x: f64, max: f64| x > 0.0 && x <= max;
         let rules = [
             (!self.name.trim().is_empty(), "name", "is empty".to_owned()),
+            (
+                self.scale.is_none_or(|scale| (SCALES[0]..=SCALES[1]).contains(&scale)),
+                "scale",
+                format!(
+                    "is {}, expected full size over the size that is measured, {} to {}",
+                    self.scale.unwrap_or_default(),
+                    SCALES[0],
+                    SCALES[1]
+                ),
+            ),
             (
                 sweep.low_hz > 0.0 && sweep.low_hz < sweep.high_hz,
                 "sweep.low_hz",
@@ -613,6 +637,7 @@ mod tests {
             "impulse_response.length = 0",
             "impulse_response.reference_temperature_c = 400",
             "sweeep.rate_hz = 1",
+            "scale = 0",
             "[grid]\nlayers = []\npoints_mm = []",
             "name = [",
             "robots.table_mm = 50",
@@ -657,8 +682,10 @@ mod tests {
               |
             1 | sweeep.rate_hz = 1
               | ^^^^^^
-            unknown field `sweeep`, expected one of `name`, `sweep`, `impulse_response`, `bands`, `panel`, `validation`, `grid`, `robots`, `devices`, `simulation`
+            unknown field `sweeep`, expected one of `name`, `scale`, `sweep`, `impulse_response`, `bands`, `panel`, `validation`, `grid`, `robots`, `devices`, `simulation`
 
+            scale = 0
+                rig `paper`: `scale` is 0, expected full size over the size that is measured, 0.1 to 1000
             [grid]
             layers = []
             points_mm = []
@@ -718,6 +745,24 @@ mod tests {
     }
 
     #[test]
+    fn the_scale_is_said_or_known() {
+        let scale = |toml: &str| Rig::from_toml(toml).map(|rig| rig.known_scale());
+        assert_eq!(scale(""), Ok(Some(10.0)));
+        assert_eq!(scale("sweep.high_hz = 20000"), Ok(Some(1.0)), "what people hear");
+        assert_eq!(scale("panel.size_mm = 600"), Ok(None));
+        assert_eq!(scale("panel.size_mm = 600\nsweep.high_hz = 20000"), Ok(Some(1.0)));
+        assert_eq!(scale("grid.points_mm = [[0, 0, 1000], [2000, 0, 1000]]"), Ok(None));
+        assert_eq!(scale("scale = 2.5\nsweep.high_hz = 20000"), Ok(Some(2.5)));
+        assert_eq!(scale("scale = 1"), Ok(Some(1.0)));
+        let wall = Rig { scale: Some(1.0), ..Rig::paper() };
+        assert_eq!(Rig::from_toml(&wall.to_toml()), Ok(wall.clone()));
+        assert_eq!(wall.differences_from(&Rig::paper()), [("scale", "1".into(), "10".into())]);
+        let open = Rig::from_toml("sweep.high_hz = 41000\npanel.size_mm = 600").expect("a rig");
+        let fields: Vec<_> = open.differences_from(&wall).into_iter().map(|(field, ..)| field).collect();
+        assert_eq!(fields, ["sweep.high_hz", "panel.size_mm"]);
+    }
+
+    #[test]
     fn differences_are_in_words() {
         let room = "impulse_response.division = \"floored\"\nbands.centres_hz = [125, 250]\npanel.size_mm = 600\n\
             sweep = { rate_hz = 48000, high_hz = 20000 }\n\
@@ -726,6 +771,7 @@ mod tests {
         let said: String =
             room.differences_from(&Rig::paper()).iter().map(|(field, a, b)| format!("{field}: {a} | {b}\n")).collect();
         expect_test::expect![[r#"
+            scale: 1 | 10
             sweep.rate_hz: 48000 | 96000
             sweep.high_hz: 20000 | 40000
             impulse_response.division: floored at -60 dB | tapered

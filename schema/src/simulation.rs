@@ -47,6 +47,10 @@ pub struct SimulationParams {
     pub directivity: bool,
     /// Speaker and microphone are louder at some frequencies.
     pub transducer_response: bool,
+    /// Frequency of a resonance of the tweeter, Hz, at which it is three times as loud. 0 for none.
+    pub resonance_hz: f64,
+    /// Quality factor of the resonance.
+    pub resonance_q: f64,
     /// Mean temperature of the air, C.
     pub temperature_c: f64,
     /// Mean relative humidity of the air, %.
@@ -70,6 +74,8 @@ impl Default for SimulationParams {
             calibration_mm: 0.17,
             directivity: true,
             transducer_response: true,
+            resonance_hz: 0.0,
+            resonance_q: 8.0,
             temperature_c: 21.5,
             humidity_pct: 45.0,
             noise_and_drift: true,
@@ -93,6 +99,9 @@ impl SimulationParams {
             return Some(
                 "expected foam_flow_resistivity from 100 to 1e6 and foam_thickness_mm from 1 to 500".to_owned(),
             );
+        }
+        if !((0.0..=1e6).contains(&self.resonance_hz) && (0.5..=100.0).contains(&self.resonance_q)) {
+            return Some("expected resonance_hz from 0 to 1e6 and resonance_q from 0.5 to 100".to_owned());
         }
         let is_room = (0.0..=40.0).contains(&self.temperature_c) && (5.0..=95.0).contains(&self.humidity_pct);
         (!is_room).then(|| "expected temperature_c from 0 to 40 and humidity_pct from 5 to 95".to_owned())

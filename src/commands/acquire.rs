@@ -17,7 +17,7 @@ use echolake_acquisition::run::session::{MeasuredRun, PreflightMode, RunSession,
 use echolake_acquisition::run::{self, RunRequest};
 use echolake_lake::{Error as LakeError, Lake, ReferenceSurfaces};
 use echolake_panel::PanelSpecimen;
-use echolake_schema::{ProjectName, Rig, SurfaceId, Timestamp};
+use echolake_schema::{ProjectName, Rig, SurfaceId, SurfaceRole, Timestamp};
 
 use crate::CommandOutcome;
 use crate::commands::replay::ViewerArgs;
@@ -41,7 +41,7 @@ pub(crate) struct AcquireArgs {
     /// repeated.
     #[arg(long, value_name = "FILE", conflicts_with_all = [
         "surface", "panel", "parameters", "set", "mesh", "side", "no_geometry", "rig", "flat", "foam",
-        "macro_reference", "project", "seed", "ir_only",
+        "macro_reference", "material", "role", "project", "seed", "ir_only",
     ])]
     pub resume: Option<PathBuf>,
     /// Relief by a name of `echolake panel --list`; by default, on the simulated rig, the one that the surface's name
@@ -75,6 +75,12 @@ pub(crate) struct AcquireArgs {
     /// Surface that has the large shape of this one and nothing on it; by default known for the paper's panels.
     #[arg(long, value_name = "NAME")]
     pub macro_reference: Option<SurfaceId>,
+    /// Material of the panel, for its absorption; a simulated rig knows it.
+    #[arg(long, value_name = "NAME")]
+    pub material: Option<String>,
+    /// What a level surface is measured for: hard (the absorption of others is measured beside it), or sample.
+    #[arg(long, value_name = "hard|sample")]
+    pub role: Option<SurfaceRole>,
     /// Project that the surface belongs to; tokens of the query service may be limited to projects.
     #[arg(long, value_name = "NAME")]
     pub project: Option<ProjectName>,
@@ -150,6 +156,8 @@ struct NewRun {
     flat: Option<SurfaceId>,
     foam: Option<SurfaceId>,
     macro_reference: Option<SurfaceId>,
+    material: Option<String>,
+    role: Option<SurfaceRole>,
     project: Option<ProjectName>,
     start: Timestamp,
     seed: u64,
@@ -350,6 +358,8 @@ async fn prepare_new_run(args: &AcquireArgs, lake_url: &str, progress: &CommandP
     }
     Ok(AcquireJob::Fresh(Box::new(NewRun {
         macro_reference: specimen::macro_reference(args, &rig)?,
+        material: args.material.clone(),
+        role: args.role,
         rig,
         surface,
         specimen,
@@ -445,6 +455,8 @@ impl NewRun {
             flat: self.flat.clone(),
             foam: self.foam.clone(),
             macro_reference: self.macro_reference.clone(),
+            material: self.material.clone(),
+            role: self.role,
             project: self.project.clone(),
             start: self.start,
             seed: self.seed,

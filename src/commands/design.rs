@@ -14,6 +14,7 @@ use anyhow::{Context as _, bail};
 use clap::Args;
 use echolake_acquisition::design::DesignSimulation;
 use echolake_acquisition::rig::robots::Choreography;
+use echolake_dsp::full_scale_octave::{OctaveGap, measured_octave};
 use echolake_lake::{Error as LakeError, Lake, ReferenceSurfaces};
 use echolake_schema::Rig;
 use serde_json::json;
@@ -23,7 +24,7 @@ use crate::progress::CommandProgress;
 use next::NextPanel;
 use report::PanelReport;
 use search::{CandidateColumns, DesignSearch};
-use target::DesignTarget;
+use target::{DesignTarget, FigureKind};
 
 /// The file of a folder that has the inputs of its search.
 const INPUTS_FILE: &str = "search.json";
@@ -54,10 +55,15 @@ pub(crate) async fn run_design(args: &DesignArgs, lake_url: &str) -> anyhow::Res
         lake => Some(lake?),
     };
     let rig = lake.as_ref().map_or_else(Rig::paper, |lake| lake.rig().clone());
+    rig.known_scale().ok_or(OctaveGap::UnknownScale).with_context(|| format!("rig `{}`", rig.name))?;
     let bands = rig.band_names();
     let text = target::read_target(&args.target)?;
     let within = || format!("target `{}`", args.target.display());
     let mut target = DesignTarget::from_toml(&text, &bands).with_context(within)?;
+    for goal in target.goals.iter().filter(|goal| goal.kind == FigureKind::Scattering) {
+        let octave = measured_octave(&rig, rig.bands.centres_hz[goal.band]);
+        octave.with_context(|| format!("`scattering` of band `{}`", bands[goal.band])).with_context(within)?;
+    }
     let (measured, references) = match &lake {
         Some(lake) => (measured::read_measured(lake, &bands).await?, lake.config().references.clone()),
         None => (Vec::new(), ReferenceSurfaces::default()),

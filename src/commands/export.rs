@@ -6,6 +6,7 @@ use std::collections::HashSet;
 
 use anyhow::Context as _;
 use clap::{Args, Subcommand, ValueEnum};
+use echolake_dsp::full_scale_octave::OctaveGap;
 use echolake_export::{
     Check, ExportSummary, Layout, MaterialBand, MaterialFormat, PendingFile, ResponseFormat, RowSymmetries, Slice,
     SliceParams, SplitBy, SplitParams, SurfaceSelection, Taken, TrainingSet, WrittenFile, format_materials,
@@ -329,6 +330,7 @@ async fn export_wav(lake: &Lake, args: &WavArgs) -> anyhow::Result<()> {
 async fn export_materials(lake: &Lake, args: &MaterialArgs) -> anyhow::Result<()> {
     let pending = PendingExport::prepare_file(&args.output).await?;
     let mut file = PendingFile::create(pending.path())?;
+    lake.rig().known_scale().ok_or(OctaveGap::UnknownScale)?;
     let session = Session::new(lake)?;
     let sql = "select * from materials order by surface_id, full_scale_hz";
     let mut rows = super::sql::query_rows::<MaterialBand>(&session, sql).await?;

@@ -1,6 +1,7 @@
 //! `echolake figure`: the paper's pictures and tables as files.
 
 mod calculated;
+mod drift;
 mod levels;
 mod output;
 mod source;
@@ -26,6 +27,8 @@ pub(crate) enum FigureCommand {
     Table(TableArgs),
     /// Levels by band with error bars, a series for each surface.
     Levels(LevelsArgs),
+    /// Control chart of a Flat: its level by band, run after run, and the runs from which on it is another.
+    Drift(DriftArgs),
     /// The filter bank.
     Filters(FiltersArgs),
     /// First Fresnel zones of a layer's pairs on the panel.
@@ -126,7 +129,7 @@ pub(crate) struct TableArgs {
     #[command(flatten)]
     output: OutputArgs,
     /// Values of the table.
-    #[arg(long, value_enum, default_value_t = ValuesArg::Levels)]
+    #[arg(long, value_enum, default_value_t = ValuesArg::Shown)]
     values: ValuesArg,
     #[command(flatten)]
     reference: ReferenceArgs,
@@ -137,7 +140,10 @@ pub(crate) struct TableArgs {
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 enum ValuesArg {
-    /// Mean of the TNCE values up to their 90th percentile, in dB, with its standard uncertainty.
+    /// Levels as pages show them: without Foam's own reflection where it is known, with their standard uncertainty.
+    Shown,
+    /// Mean of the TNCE values up to their 90th percentile, in dB, with its standard uncertainty; as in the paper, it
+    /// holds Foam's own reflection.
     Levels,
     /// The same without Foam's own reflection, which is estimated.
     UnbiasedLevels,
@@ -160,6 +166,18 @@ pub(crate) struct LevelsArgs {
     /// Subtract the levels of this surface from those of the others.
     #[arg(long, value_name = "SURFACE")]
     less: Option<SurfaceId>,
+    /// Draw levels as in the paper, which hold Foam's own reflection.
+    #[arg(long)]
+    measured: bool,
+}
+
+#[derive(Debug, Args)]
+pub(crate) struct DriftArgs {
+    /// The Flat; by default the lake's.
+    #[arg(value_name = "SURFACE")]
+    surface: Option<SurfaceId>,
+    #[command(flatten)]
+    output: OutputArgs,
 }
 
 #[derive(Debug, Args)]
@@ -249,6 +267,7 @@ impl FigureCommand {
         let (output, formats) = match self {
             Self::Table(args) => (&args.output, FigureFormats::Table),
             Self::Levels(args) => (&args.output, FigureFormats::Chart),
+            Self::Drift(args) => (&args.output, FigureFormats::Chart),
             Self::Grid(GridArgs { output, .. })
             | Self::Nce(NceArgs { output, .. })
             | Self::Filters(FiltersArgs { output, .. })
@@ -272,6 +291,7 @@ pub(crate) async fn run_figure(command: &FigureCommand, lake_url: &str) -> anyho
         FigureCommand::Nce(args) => surfaces::write_nce(&source, args).await?,
         FigureCommand::Table(args) => tables::write_table(&source, args).await?,
         FigureCommand::Levels(args) => levels::write_levels(&source, args).await?,
+        FigureCommand::Drift(args) => drift::write_drift(&source, args).await?,
         FigureCommand::Filters(args) => calculated::write_filters(&source, args)?,
         FigureCommand::Coverage(args) => calculated::write_coverage(&source, args)?,
         FigureCommand::Steps(args) => surfaces::write_steps(&source, args).await?,

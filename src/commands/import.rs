@@ -3,9 +3,10 @@
 use echolake_acquisition::disk::read_text_file;
 use echolake_import::{
     Error, GIR_IR_LEN, ImportOptions, ImportedRun, check_hdf5, check_rew, check_sofa, check_wav, import_gir,
-    import_hdf5, import_rew, import_sofa, import_wav, sampling_rate_of,
+    import_hdf5, import_rew, import_sofa, import_wav, sampling_rate_of, scale_of_manifest,
 };
 use echolake_lake::{Lake, ReferenceSurfaces};
+use echolake_schema::interchange::{REW_MANIFEST, WAV_MANIFEST};
 use echolake_schema::{AirTreatment, Celsius, ProjectName, Rig, SpectralDivision, Timestamp};
 
 use crate::CommandOutcome;
@@ -76,6 +77,21 @@ enum ImportCommand {
     },
 }
 
+// A manifest may say the scale that its rig leaves open.
+fn with_scale(rig: Rig, said: Option<f64>) -> anyhow::Result<Rig> {
+    match (rig.scale, said) {
+        (Some(known), Some(said)) if known != said => {
+            anyhow::bail!("the manifest's `scale` is {said}, that of rig `{}` is {known}", rig.name)
+        }
+        (_, None) => Ok(rig),
+        (_, scale) => {
+            let rig = Rig { scale, ..rig };
+            rig.check_consistency()?;
+            Ok(rig)
+        }
+    }
+}
+
 pub(crate) async fn run_import(args: &ImportArgs, lake_url: &str) -> anyhow::Result<CommandOutcome> {
     let ImportArgs { project, format: args } = args;
     let rig = match args {
@@ -95,6 +111,11 @@ pub(crate) async fn run_import(args: &ImportArgs, lake_url: &str) -> anyhow::Res
         ImportCommand::Rew { rig, .. } | ImportCommand::Sofa { rig, .. } | ImportCommand::Hdf5 { rig, .. } => {
             super::rig_or(rig.as_deref(), lake_url, Rig::paper).await?
         }
+    };
+    let rig = match args {
+        ImportCommand::Wav { manifest, .. } => with_scale(rig, scale_of_manifest(manifest, &WAV_MANIFEST)?)?,
+        ImportCommand::Rew { manifest, .. } => with_scale(rig, scale_of_manifest(manifest, &REW_MANIFEST)?)?,
+        _ => rig,
     };
     // All is checked and written beside the lake's tables before a lake is made for it.
     let existing = match Lake::open(lake_url).await {

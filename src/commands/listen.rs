@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use anyhow::Context as _;
 use clap::{Args, ValueEnum};
+use echolake_dsp::full_scale_octave::OctaveGap;
 use echolake_export::{DryRecording, ListenedResponse, write_sounds};
 use echolake_import::DryWav;
 use echolake_lake::Lake;
@@ -68,7 +69,7 @@ pub(crate) async fn run_listen(args: &ListenArgs, lake_url: &str) -> anyhow::Res
         rows.push(newest_response(&session, args, &flat).await?);
     }
     // Models are smaller than what they stand for, and sound is as fast: all takes longer at full scale.
-    let scale = lake.rig().model_scale();
+    let scale = lake.rig().known_scale().ok_or(OctaveGap::UnknownScale)?;
     let rate_hz = (lake.rig().sweep.rate_hz.get() / scale).round() as u32;
     let names: Vec<String> =
         rows.iter().map(|row| format!("{}-{}-{}", row.surface_id, args.pair, row.origin)).collect();

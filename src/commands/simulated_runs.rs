@@ -193,6 +193,8 @@ impl SimulationState<'_> {
             flat: flat.clone(),
             foam: foam.clone(),
             macro_reference: macro_reference.clone(),
+            material: None,
+            role: None,
             project: project.clone(),
             start: *start,
             seed: *seed,

@@ -227,6 +227,8 @@ impl TwinComputation {
             flat: Some(FLAT.parse()?),
             foam: Some(FOAM.parse()?),
             macro_reference: None,
+            material: None,
+            role: None,
             project: run.project.clone(),
             start: COMPUTED_AT,
             seed: 0,

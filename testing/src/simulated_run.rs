@@ -42,6 +42,8 @@ pub fn simulate_project_run(
         flat: None,
         foam: None,
         macro_reference: None,
+        material: None,
+        role: None,
         project: project.map(|name| name.parse().expect("a project")),
         start: Timestamp(1_767_600_000_000_000_000).plus_secs(number as f64 * 3_600.0),
         seed: number as u64 + 1,

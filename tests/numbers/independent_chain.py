@@ -568,7 +568,7 @@ def demo_lake(program: str, folder: pathlib.Path, grid: str, division: str, air:
 
 def rig_text(grid: str, secs: float, division: str, air: str = "complete") -> str:
     response = f'[impulse_response]\ndivision = "{division}"\nair = "{air}"\n'
-    return f'name = "numbers"\n[sweep]\nduration_secs = {secs}\n{response}{grid}'
+    return f'name = "numbers"\nscale = 10\n[sweep]\nduration_secs = {secs}\n{response}{grid}'
 
 
 def panel_lake(program: str, folder: pathlib.Path, secs: float, seeds: Sequence[int]) -> MeasuredLake:

@@ -8,6 +8,7 @@ uncertainty, which should be 95 %.
     --folder FOLDER  keeps the lakes there, and uses those that are there already
     --runs N         repeats, 20 by default
     --surfaces S...  the panels
+    --resonance      a tweeter with a resonance at 9 kHz, of quality factor 8
 
 Needs what `independent_chain.py` needs. Exits with 1 if less than 93 % or more than 97 % of the levels of a band are
 held.
@@ -30,7 +31,9 @@ COVERAGE_FACTOR = 1.96
 SHARES = (0.93, 0.97)
 
 
-def measured_lake(program: str, folder: pathlib.Path, surfaces: Sequence[str], run: int | None) -> MeasuredLake:
+def measured_lake(
+    program: str, folder: pathlib.Path, surfaces: Sequence[str], run: int | None, tweeter: str
+) -> MeasuredLake:
     """The panels and their references with seeds of their own; without a run, those without chance."""
     text = rig_text(SMALL_GRID, SECS, "tapered")
     every = ["flat", "foam", *surfaces]
@@ -39,7 +42,7 @@ def measured_lake(program: str, folder: pathlib.Path, surfaces: Sequence[str], r
     rigs = [folder / f"{name}-{surface}.toml" for surface in every]
     folder.mkdir(parents=True, exist_ok=True)
     for rig, seed in zip(rigs, seeds, strict=True):
-        rig.write_text(text + (QUIET + REFERENCE_AIR if run is None else drawn_air(seed)))
+        rig.write_text(text + (QUIET + REFERENCE_AIR if run is None else drawn_air(seed)) + tweeter)
     acquire = [
         ["acquire", "--rig", str(rig), "--seed", str(seed + 1), "--surface", surface]
         for rig, seed, surface in zip(rigs, seeds, every, strict=True)
@@ -83,16 +86,18 @@ def main() -> int:
     parser.add_argument("--folder", type=pathlib.Path)
     parser.add_argument("--runs", type=int, default=20)
     parser.add_argument("--surfaces", nargs="+", default=["river_rock", "stretcher_bond", "macrostructure"])
+    parser.add_argument("--resonance", action="store_true")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as place:
         return count_held(options, options.folder or pathlib.Path(place))
 
 
 def count_held(options: argparse.Namespace, folder: pathlib.Path) -> int:
-    truth = measured_lake(options.program, folder, options.surfaces, None)
+    tweeter = "resonance_hz = 9000.0\nresonance_q = 8.0\n" if options.resonance else ""
+    truth = measured_lake(options.program, folder, options.surfaces, None, tweeter)
     found: dict[tuple[str, str], list[float]] = {}
     for run in range(options.runs):
-        lake = measured_lake(options.program, folder, options.surfaces, run)
+        lake = measured_lake(options.program, folder, options.surfaces, run, tweeter)
         for surface in options.surfaces:
             for column, u_column in level_columns(lake).items():
                 found.setdefault(("a measurement", column), []).extend(

@@ -52,7 +52,7 @@ fn an_agent_asks_by_tools() {
 
     let tables = call(&server, "list_tables", json!({})).expect("tables");
     let meanings: Vec<_> = tables["tables"].as_array().expect("a list").iter().map(|t| &t["meaning"]).collect();
-    assert!(meanings.len() == 29 && meanings.iter().all(|meaning| meaning.is_string()), "{tables}");
+    assert!(meanings.len() == 30 && meanings.iter().all(|meaning| meaning.is_string()), "{tables}");
     let described = call(&server, "describe_table", json!({ "table": "pairs" })).expect("a table");
     let direct = described["columns"].as_array().expect("a list").iter().find(|c| c["name"] == "direct_mm");
     assert_eq!(direct.expect("a column")["unit"], "mm");

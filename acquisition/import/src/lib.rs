@@ -29,6 +29,7 @@ pub use rew::{check_rew, import_rew};
 pub use sofa::{check_sofa, import_sofa};
 pub use wav::{check_wav, import_wav, sampling_rate_of};
 pub use wav_file::DryWav;
+pub use wav_manifest::{ManifestColumns, scale_of_manifest};
 
 /// Interval between the beginnings of runs whose files have no times, s: as they would be measured.
 const RUN_SECS: f64 = 36_600.0;

@@ -7,7 +7,6 @@ mod rew_text;
 #[cfg(test)]
 mod tests;
 
-use std::collections::BTreeMap;
 use std::path::Path;
 
 use echolake_acquisition::run::recorder::{LogLevel, RunStart};
@@ -16,7 +15,7 @@ use echolake_dsp::geometry::direct_mm;
 use echolake_dsp::temperature::ReferenceAir;
 use echolake_schema::interchange::REW_MANIFEST;
 use echolake_schema::manifest::{Origin, RunEnd};
-use echolake_schema::{Celsius, Grid, Pair, Rig, SurfaceId, Timestamp};
+use echolake_schema::{Celsius, Grid, Pair, Rig, Timestamp};
 use realfft::RealFftPlanner;
 use realfft::num_complex::Complex;
 
@@ -24,7 +23,7 @@ use self::rew_text::RewText;
 use crate::batch::ImportBatch;
 use crate::response::{ImportedResponse, known_celsius, least_length, record_unknown_air};
 use crate::wav_file::{WavChannel, split_reference};
-use crate::wav_manifest::{ManifestCells, next_record, no_rows, open_manifest};
+use crate::wav_manifest::{ManifestCells, SurfaceFacts, SurfaceRows, next_record, no_rows, open_manifest};
 use crate::{Error, ImportOptions, ImportedRun};
 
 /// Source name of the import's log entries.
@@ -45,11 +44,11 @@ pub fn import_rew(
 ) -> Result<Vec<ImportedRun>, Error> {
     let grid = rig.build_grid()?;
     let surfaces = read_rows(manifest, rig, &grid)?;
-    let total = surfaces.values().map(Vec::len).sum();
+    let total = surfaces.values().map(|(_, rows)| rows.len()).sum();
     let mut runs = Vec::new();
     let mut batch = ImportBatch::default();
     let mut done = 0;
-    for (surface, mut rows) in surfaces {
+    for (surface, (facts, mut rows)) in surfaces {
         // A run's file is in the order of time.
         for (index, row) in (0u32..).zip(&mut rows) {
             row.response.at = row.recorded_at.unwrap_or_else(|| options.started.plus_secs(f64::from(index)));
@@ -58,7 +57,7 @@ pub fn import_rew(
         let [started, ended] = [rows.first(), rows.last()].map(|row| row.map_or(options.started, |r| r.response.at));
         let run_manifest = crate::make_manifest(Origin::ImportedRew, &surface, rig, started)?;
         let path = options.folder.join(format!("{}.mcap", run_manifest.run_id));
-        let record = options.surface_record("imported");
+        let record = facts.fill_record(options.surface_record("imported"));
         let start = RunStart { manifest: &run_manifest, rig, surface: &record, relief: None, plan: None };
         let mut recorder = batch.create_run(&path, &start)?;
         let measurements = rows.len();
@@ -117,13 +116,14 @@ struct RewResponse {
     warnings: Vec<String>,
 }
 
-fn read_rows(path: &Path, rig: &Rig, grid: &Grid) -> Result<BTreeMap<SurfaceId, Vec<RewRow>>, Error> {
+fn read_rows(path: &Path, rig: &Rig, grid: &Grid) -> Result<SurfaceRows<RewRow>, Error> {
     let (mut reader, places) = open_manifest(path, &REW_MANIFEST)?;
-    let mut surfaces: BTreeMap<SurfaceId, Vec<RewRow>> = BTreeMap::new();
+    let mut surfaces = SurfaceRows::new();
     while let Some(record) = next_record(path, &mut reader)? {
         let cells = ManifestCells { path, columns: &REW_MANIFEST, places: &places, record: &record };
         let row = parse_row(&cells, rig, grid)?;
-        let rows = surfaces.entry(cells.parse_cell("surface")?).or_default();
+        let (facts, rows): &mut (SurfaceFacts, Vec<RewRow>) = surfaces.entry(cells.parse_cell("surface")?).or_default();
+        facts.add_row(&cells)?;
         if let Some(twin) = rows.iter().find(|other| other.response.pair == row.response.pair) {
             return Err(cells.cell_error("speaker", format!("this pair is in line {} already", twin.line)));
         }

@@ -15,7 +15,7 @@ use echolake_dsp::deconvolution::{DeconvolutionParams, TransformLength};
 use echolake_dsp::geometry::direct_mm;
 use echolake_dsp::response_deconvolution::ResponseDeconvolution;
 use echolake_dsp::take_analysis::TakeFault;
-use echolake_dsp::temperature::{ReferenceAir, response_limits_hz};
+use echolake_dsp::temperature::{ReferenceAir, response_limits_hz, stretch_recording};
 use echolake_schema::manifest::{Origin, RunEnd};
 use echolake_schema::messages::{AmbientSample, ImpulseResponse, Measurement, SweepRecording, Verdict};
 use echolake_schema::{Grid, Rig, SampleRate, SurfaceId, Timestamp};
@@ -23,7 +23,7 @@ use echolake_schema::{Grid, Rig, SampleRate, SurfaceId, Timestamp};
 use crate::batch::ImportBatch;
 use crate::response::{describe_unknown_air, known_celsius};
 use crate::take_summary::TakeSummary;
-use crate::wav_manifest::{self, ManifestRow};
+use crate::wav_manifest::{self, ManifestRow, SurfaceFacts};
 use crate::{Error, ImportOptions, ImportedRun, wav_search};
 
 /// Source name of the import's log entries.
@@ -54,11 +54,11 @@ pub fn import_wav(
 ) -> Result<Vec<ImportedRun>, Error> {
     let grid = rig.build_grid()?;
     let surfaces = wav_manifest::read_manifest(manifest, rig, &grid)?;
-    let total = surfaces.values().map(Vec::len).sum();
+    let total = surfaces.values().map(|(_, rows)| rows.len()).sum();
     let (mut runs, mut batch, mut done) = (Vec::new(), ImportBatch::default(), 0);
-    for (surface, rows) in surfaces {
+    for (surface, (facts, rows)) in surfaces {
         let import = WavImport { manifest, rig, grid: &grid, options };
-        let run = import.surface(surface, &rows, &mut batch, &mut || {
+        let run = import.surface(surface, &facts, &rows, &mut batch, &mut || {
             done += 1;
             progress(done, total);
         })?;
@@ -79,6 +79,7 @@ impl WavImport<'_> {
     fn surface(
         &self,
         surface: SurfaceId,
+        facts: &SurfaceFacts,
         rows: &[ManifestRow],
         batch: &mut ImportBatch,
         done: &mut dyn FnMut(),
@@ -88,7 +89,7 @@ impl WavImport<'_> {
         timed.sort_by_key(|(time, _)| *time);
         let started = timed.first().map_or(self.options.started, |(time, _)| *time);
         let manifest = crate::make_manifest(Origin::ImportedWav, &surface, self.rig, started)?;
-        let record = self.options.surface_record("imported");
+        let record = facts.fill_record(self.options.surface_record("imported"));
         let path = self.options.folder.join(format!("{}.mcap", manifest.run_id));
         let start = RunStart { manifest: &manifest, rig: self.rig, surface: &record, relief: None, plan: None };
         let mut recorder = batch.create_run(&path, &start)?;
@@ -184,6 +185,24 @@ impl WavImport<'_> {
         let channels: [&[f32]; 2] = [&microphone.fractions, &loopback.fractions];
         let joint = plan.joint_spectrum(&mut scratch);
         let mut assessment = assessor.assess_take(channels, joint, arrival, clipped).map_err(planned)?;
+        let playing_clock_ppm = assessment.analysis.recording_clock_ppm;
+        let mut stretched = Vec::new();
+        if let Some(ppm) = playing_clock_ppm {
+            stretched.clone_from(&microphone.fractions);
+            stretch_recording(&mut stretched, ppm);
+            plan.run_within(limits_hz, &stretched, &loopback.fractions, &mut samples, &mut scratch)
+                .map_err(|e| unread("loopback", e.to_string()))?;
+            let channels: [&[f32]; 2] = [&stretched, &loopback.fractions];
+            let joint = plan.joint_spectrum(&mut scratch);
+            let again = assessor.assess_take(channels, joint, arrival, clipped).map_err(planned)?;
+            assessment.arrival_error_us = again.arrival_error_us;
+            assessment.analysis.faults.extend(
+                again
+                    .analysis
+                    .recording_clock_ppm
+                    .map(|left| TakeFault::Clock { ppm: ppm + left, limit_ppm: ppm.abs() }),
+            );
+        }
         check_response(assessor.response(), samples.len(), arrival, rig).map_err(|e| unread("recording", e))?;
         // The geometry of a foreign rig is known less well than its files say, and the level outside was not recorded:
         // the arrival is recorded, not judged, and so is a signal-to-noise ratio that a long response leaves no room
@@ -254,6 +273,7 @@ impl WavImport<'_> {
                 temperature_c: celsius,
                 humidity_pct: Some(air.humidity_pct),
                 pressure_hpa: Some(air.pressure_hpa),
+                playing_clock_ppm,
             },
         )?;
         recorder.ir(

@@ -7,7 +7,7 @@ use csv::StringRecord;
 use echolake_acquisition::disk::BoundedFile;
 use echolake_schema::interchange::WAV_MANIFEST;
 use echolake_schema::messages::SampleFormat;
-use echolake_schema::{Celsius, Grid, Pair, PairId, Rig, SurfaceId, Timestamp};
+use echolake_schema::{Celsius, Grid, Pair, PairId, Rig, SurfaceId, SurfaceRecord, SurfaceRole, Timestamp};
 
 use crate::Error;
 use crate::wav_file::{WavChannel, common_format};
@@ -34,11 +34,70 @@ pub(crate) struct ManifestRow {
 }
 
 /// Columns that a manifest may have.
-pub(crate) type ManifestColumns = &'static [&'static str];
+pub type ManifestColumns = &'static [&'static str];
 /// A manifest's rows, and the place of each column.
 type OpenManifest = (csv::Reader<BoundedFile>, Vec<Option<usize>>);
-/// A manifest's rows by surface.
-pub(crate) type WavManifest = BTreeMap<SurfaceId, Vec<ManifestRow>>;
+/// Rows of a manifest by surface, with what they say of it.
+pub(crate) type SurfaceRows<R> = BTreeMap<SurfaceId, (SurfaceFacts, Vec<R>)>;
+
+/// What a manifest says of a surface in one row or more.
+#[derive(Debug, Default)]
+pub(crate) struct SurfaceFacts {
+    material: Option<String>,
+    role: Option<SurfaceRole>,
+}
+
+impl SurfaceFacts {
+    /// Adds what a row says.
+    ///
+    /// # Errors
+    /// [`Error::Row`] if another row says otherwise.
+    pub fn add_row(&mut self, cells: &ManifestCells<'_>) -> Result<(), Error> {
+        keep_one(&mut self.material, cells.get("material").map(str::to_owned), |other| {
+            cells.cell_error("material", format!("another row of this surface has `{other}`"))
+        })?;
+        let role = cells.get("role").map(|_| cells.parse_cell("role")).transpose()?;
+        keep_one(&mut self.role, role, |other: &SurfaceRole| {
+            cells.cell_error("role", format!("another row of this surface has `{}`", other.name()))
+        })
+    }
+
+    /// Fills them into a surface's record.
+    pub fn fill_record(&self, record: SurfaceRecord) -> SurfaceRecord {
+        SurfaceRecord { material: self.material.clone(), role: self.role, ..record }
+    }
+}
+
+fn keep_one<T: PartialEq>(
+    known: &mut Option<T>,
+    said: Option<T>,
+    refuse: impl FnOnce(&T) -> Error,
+) -> Result<(), Error> {
+    match (&known, said) {
+        (Some(known), Some(said)) if *known != said => Err(refuse(known)),
+        (None, said) => {
+            *known = said;
+            Ok(())
+        }
+        _ => Ok(()),
+    }
+}
+
+/// Returns the scale that a manifest of recordings or of responses says, in one row or more: see [`Rig::known_scale`].
+///
+/// # Errors
+/// [`Error`], naming the row.
+pub fn scale_of_manifest(path: &Path, columns: ManifestColumns) -> Result<Option<f64>, Error> {
+    let (mut reader, places) = open_manifest(path, columns)?;
+    let mut scale = None;
+    while let Some(record) = next_record(path, &mut reader)? {
+        let cells = ManifestCells { path, columns, places: &places, record: &record };
+        keep_one(&mut scale, cells.parse_number("scale")?, |other: &f64| {
+            cells.cell_error("scale", format!("another row has {other}"))
+        })?;
+    }
+    Ok(scale)
+}
 
 /// Opens a manifest and checks its header; returns the place of each column.
 pub(crate) fn open_manifest(path: &Path, columns: ManifestColumns) -> Result<OpenManifest, Error> {
@@ -72,14 +131,15 @@ pub(crate) fn first_recording(path: &Path) -> Result<WavChannel, Error> {
 }
 
 /// Reads and checks all rows.
-pub(crate) fn read_manifest(path: &Path, rig: &Rig, grid: &Grid) -> Result<WavManifest, Error> {
+pub(crate) fn read_manifest(path: &Path, rig: &Rig, grid: &Grid) -> Result<SurfaceRows<ManifestRow>, Error> {
     let (mut reader, places) = open_manifest(path, &WAV_MANIFEST)?;
-    let mut manifest = WavManifest::new();
+    let mut manifest = SurfaceRows::new();
     while let Some(record) = next_record(path, &mut reader)? {
         let cells = ManifestCells { path, columns: &WAV_MANIFEST, places: &places, record: &record };
         let surface: SurfaceId = cells.parse_cell("surface")?;
         let row = cells.parse_row(rig, grid)?;
-        let rows = manifest.entry(surface).or_default();
+        let (facts, rows): &mut (SurfaceFacts, Vec<ManifestRow>) = manifest.entry(surface).or_default();
+        facts.add_row(&cells)?;
         if let Some(twin) = rows.iter().find(|r| r.pair == row.pair && r.attempt == row.attempt) {
             let what = format!(
                 "attempt {} at this pair is in line {} already; hint: number the attempts",
@@ -159,8 +219,10 @@ impl ManifestCells<'_> {
     // A sweep through a model is compared with that of Flat in other air. A room is what it is.
     fn parse_sweep_celsius(&self, rig: &Rig) -> Result<Option<Celsius>, Error> {
         match self.parse_celsius()? {
-            None if rig.model_scale() != 1.0 => {
-                Err(self.cell_error("temperature_c", "it is empty, and levels of a model are corrected by it"))
+            None if rig.known_scale() != Some(1.0) => {
+                let what = "it is empty, and levels of a model are corrected by it; hint: `scale = 1` in the rig file \
+                            of a room or wall";
+                Err(self.cell_error("temperature_c", what))
             }
             known => Ok(known),
         }

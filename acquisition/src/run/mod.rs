@@ -19,7 +19,7 @@ use std::sync::Arc;
 
 use echolake_panel::{PanelGeometry, PanelSpecimen, PreparedPanel, mesh};
 use echolake_schema::manifest::{Origin, RunManifest};
-use echolake_schema::{ProjectName, Rig, RunId, SurfaceId, Timestamp};
+use echolake_schema::{ProjectName, Rig, RunId, SurfaceId, SurfaceRole, Timestamp};
 use tracing::Span;
 
 use crate::disk::folder_of;
@@ -49,6 +49,10 @@ pub struct RunRequest<'a> {
     pub foam: Option<SurfaceId>,
     /// The surface that has its large shape and nothing on it.
     pub macro_reference: Option<SurfaceId>,
+    /// Its material, if it is not that of the specimen.
+    pub material: Option<String>,
+    /// What its level stands for in the absorption of other surfaces.
+    pub role: Option<SurfaceRole>,
     /// The project that it belongs to.
     pub project: Option<ProjectName>,
     /// Time of its begin.
@@ -110,6 +114,8 @@ impl<'a> RunRequest<'a> {
             flat: None,
             foam: None,
             macro_reference: None,
+            material: None,
+            role: None,
             project: None,
             start,
             seed: 1,
@@ -157,6 +163,8 @@ impl<'a> RunRequest<'a> {
         surface.flat_reference = self.flat.clone();
         surface.foam_reference = self.foam.clone();
         surface.macro_reference = self.macro_reference.clone();
+        surface.material = self.material.clone().or(surface.material);
+        surface.role = self.role;
         surface.project = self.project.clone();
         let relief = panel.geometry.as_ref().map(|PanelGeometry { heights, mesh, .. }| {
             let original = panel.original_file();

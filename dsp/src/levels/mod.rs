@@ -7,6 +7,7 @@ pub mod energy;
 pub mod envelope;
 pub mod filter_bank;
 pub mod frequency_response;
+pub mod full_scale_octave;
 pub mod level;
 pub mod mean;
 mod noise_crossing;

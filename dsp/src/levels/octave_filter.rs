@@ -6,6 +6,7 @@ use realfft::num_complex::Complex;
 
 use crate::arrival::first_arrival;
 use crate::error::check_len;
+use crate::spectrum::bin_count;
 use crate::{Error, RealSample};
 
 /// An octave is a frequency ratio of 10^(3/10), IEC 61260-1:2014, 5.2.
@@ -102,6 +103,12 @@ impl OctaveBand {
         is_near.then(|| Self { midband_hz, low_hz: midband_hz / half, high_hz: midband_hz * half })
     }
 
+    /// Returns the octave whose midband frequency is this one, Hz.
+    pub fn around(midband_hz: f64) -> Self {
+        let half = 10f64.powf(OCTAVE_DECADES / 2.0);
+        Self { midband_hz, low_hz: midband_hz / half, high_hz: midband_hz * half }
+    }
+
     /// Returns the bandwidth, Hz.
     pub fn width_hz(&self) -> f64 {
         self.high_hz - self.low_hz
@@ -170,6 +177,12 @@ impl OctaveFilter {
             }
         }
         Ok(())
+    }
+
+    /// Returns the share of the energy of each bin that passes, of a transform of `len` samples: `[len / 2 + 1]`.
+    pub fn bin_shares(&self, len: usize) -> Vec<f64> {
+        let gain = |angle: f64| self.sections.iter().map(|section| section.magnitude(angle)).product::<f64>();
+        (0..bin_count(len)).map(|bin| gain(TAU * bin as f64 / len as f64).powi(2)).collect()
     }
 
     #[cfg(test)]

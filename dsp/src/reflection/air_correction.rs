@@ -30,8 +30,13 @@ const INVERSE_FACTORIALS: [f64; 9] =
 /// Greatest number whose exponential is computed by them, within 1.1e-11.
 const SERIES_LIMIT: f64 = 0.25;
 
-/// Half of the width that slopes are smoothed over, as a ratio of frequencies: a third of an octave in all.
+/// Half of the width that slopes are smoothed over, as a ratio of frequencies: a third of an octave in all, if there are
+/// too few pairs for other sound to average out.
 const SMOOTHED_RATIO: f64 = 1.122_462_048_309_373;
+/// The same with enough pairs, Hz: a resonance of a tweeter is wider, and noise beside it hardly counts.
+const SMOOTHED_HZ: f64 = 250.0;
+/// Pairs that are enough.
+const ENOUGH_PAIRS: usize = 24;
 
 /// Learns the slopes of speaker and microphone from the direct sound and from what Flat reflects.
 ///
@@ -105,7 +110,8 @@ impl<T: RealSample> AirCorrectionFit<T> {
             let metres = path.metres / self.pairs.max(1) as f64;
             let bins = path.spectrum.iter().zip(&absorption);
             let emitted: Vec<_> = bins.map(|(x, nepers)| x * (metres * nepers).exp()).collect();
-            spectral_slopes(&emitted, step_hz, self.range_hz)
+            let half_width = (self.pairs >= ENOUGH_PAIRS).then(|| (SMOOTHED_HZ / step_hz).round().max(1.0) as usize);
+            spectral_slopes(&emitted, step_hz, self.range_hz, half_width)
         };
         let reflected_slopes = slopes(&self.reflected);
         let changes = by_bin(&warmer).into_iter().zip(by_bin(&colder)).map(|(warm, cold)| 2.0 * (cold - warm));
@@ -202,6 +208,19 @@ impl AirEffect {
         for (nepers, square) in nepers_per_m.iter_mut().zip(squares) {
             *nepers = NEPER_PER_DB * self.absorption.db_per_m_of_square(square * factor);
         }
+    }
+}
+
+impl<T: RealSample> AirScratch<T> {
+    /// Returns the gain by which the response that was taken last holds the direct sound with this spectrum `[bins]`:
+    /// about 1, and -1 if the microphone's polarity is inverted.
+    pub fn direct_gain(&self, direct: &[Complex<T>]) -> f64 {
+        let mut sums = [0.0; 2];
+        for (x, d) in self.response.iter().zip(direct) {
+            sums[0] += (x.re * d.re + x.im * d.im).f64();
+            sums[1] += d.norm_sqr().f64();
+        }
+        sums[0] / sums[1]
     }
 }
 
@@ -374,16 +393,22 @@ fn transform<T: RealSample>(
     if is_finite { Ok(()) } else { Err(Error::NotFinite { what: "the response" }) }
 }
 
-// d ln(spectrum) / d ln(frequency) between neighbours within the range that the sweep has, smoothed; beyond the range
-// the nearest one's.
-fn spectral_slopes(spectrum: &[Complex<f64>], step_hz: f64, [low_hz, high_hz]: [f64; 2]) -> Vec<Complex<f64>> {
+// d ln(spectrum) / d ln(frequency) between neighbours within the range that the sweep has, smoothed over so many bins to
+// either side, or over a third of an octave; beyond the range the nearest one's.
+fn spectral_slopes(
+    spectrum: &[Complex<f64>],
+    step_hz: f64,
+    [low_hz, high_hz]: [f64; 2],
+    half_width: Option<usize>,
+) -> Vec<Complex<f64>> {
     // The bins whose neighbours are within the range and no part of its tapers.
     let first = (low_hz * 1.02 / step_hz).ceil() as usize + 2;
     let last = ((high_hz * 0.98 / step_hz).floor() as usize).saturating_sub(2).min(spectrum.len().saturating_sub(2));
     let smoothed = |bin: usize| {
         let bin = bin.clamp(first, last.max(first));
-        let lowest = ((bin as f64 / SMOOTHED_RATIO).round() as usize).max(first);
-        let highest = ((bin as f64 * SMOOTHED_RATIO).round() as usize).min(last);
+        let third = || [(bin as f64 / SMOOTHED_RATIO).round() as usize, (bin as f64 * SMOOTHED_RATIO).round() as usize];
+        let [lowest, highest] = half_width.map_or_else(third, |half| [bin.saturating_sub(half), bin + half]);
+        let [lowest, highest] = [lowest.max(first), highest.min(last)];
         let mut sum = Complex::default();
         let mut weights = 0.0;
         for (bin, around) in
@@ -412,12 +437,19 @@ mod tests {
     const REFLECTED_M: f64 = 0.7;
 
     // A tweeter that gets louder by 12 dB an octave, and turns the phase by 2 for each factor e.
-    fn emitted(hz: f64) -> Complex<f64> {
+    fn smooth(hz: f64) -> Complex<f64> {
         Complex::from_polar((hz / 10e3).powi(2), 2.0 * (hz / 10e3).ln())
     }
 
+    // The same with a resonance at 9 kHz, of quality factor 8.
+    fn resonant(hz: f64) -> Complex<f64> {
+        let ratio = hz / 9e3;
+        let damping = Complex::new(0.0, ratio / 8.0);
+        smooth(hz) * (1.0 + 2.0 * damping / (1.0 - ratio * ratio + damping))
+    }
+
     // Both paths' sound in air, on the reference's time axis: their delays are the same in all air.
-    fn response(air: &AirState, reflected: f64) -> Vec<f64> {
+    fn response(emitted: fn(f64) -> Complex<f64>, air: &AirState, reflected: f64) -> Vec<f64> {
         let effect = AirEffect::new(&REFERENCE, air);
         let nepers_per_m = |hz: f64| NEPER_PER_DB * effect.absorption.db_per_m(hz * effect.ratio);
         let mut spectrum: Vec<_> = (0..LEN / 2 + 1)
@@ -440,47 +472,67 @@ mod tests {
         signal
     }
 
-    fn correction() -> AirCorrection<f64> {
+    fn correction(emitted: fn(f64) -> Complex<f64>, pairs: usize) -> AirCorrection<f64> {
         let mut fit = AirCorrectionFit::new(LEN, RATE_HZ, [2e3, 40e3], REFERENCE);
         let air = REFERENCE.air();
-        let silent = response(&air, 0.0);
-        let reflected: Vec<f64> = response(&air, 1.0).iter().zip(&silent).map(|(all, direct)| all - direct).collect();
-        fit.add_pair(&silent, &reflected, [DIRECT_M, REFLECTED_M]).expect("a pair");
+        let silent = response(emitted, &air, 0.0);
+        let all = response(emitted, &air, 1.0);
+        let reflected: Vec<f64> = all.iter().zip(&silent).map(|(all, direct)| all - direct).collect();
+        for _ in 0..pairs {
+            fit.add_pair(&silent, &reflected, [DIRECT_M, REFLECTED_M]).expect("a pair");
+        }
         fit.finish()
     }
 
-    #[test]
-    fn reflections_are_those_of_the_reference_air() {
-        let correction = correction();
+    // Returns the greatest difference from what is reflected in the reference air, dB re its energy.
+    fn greatest_difference_db(emitted: fn(f64) -> Complex<f64>, pairs: usize) -> f64 {
+        let correction = correction(emitted, pairs);
         let mut scratch = correction.make_scratch();
         let reference = REFERENCE.air();
-        let silent = response(&reference, 0.0);
-        let expected: Vec<f64> = response(&reference, 0.5).iter().zip(&silent).map(|(all, d)| all - d).collect();
+        let silent = response(emitted, &reference, 0.0);
+        let all = response(emitted, &reference, 0.5);
+        let expected: Vec<f64> = all.iter().zip(&silent).map(|(all, d)| all - d).collect();
+        let mut greatest_db = f64::NEG_INFINITY;
         for (celsius, humidity_pct) in [(18.0, 30.0), (25.0, 60.0), (20.0, 50.0)] {
             let own = AirState { temperature_c: celsius, humidity_pct, pressure_hpa: 965.0 };
             let other = AirState { temperature_c: 22.0, humidity_pct: 40.0, pressure_hpa: 980.0 };
             let pair = PairAir { response: own, direct: other, direct_m: DIRECT_M, reflected_m: REFLECTED_M };
-            let direct = correction.transform_response(response(&other, 0.0), &mut scratch).expect("a spectrum");
+            let direct = response(emitted, &other, 0.0);
+            let direct = correction.transform_response(direct, &mut scratch).expect("a spectrum");
             let mut reflected = correction.make_reflected();
             reflected.samples.fill(f64::NAN);
-            correction
-                .subtract_direct(&response(&own, 0.5), &direct, &pair, &mut reflected, &mut scratch)
-                .expect("a reflection");
+            let measured = response(emitted, &own, 0.5);
+            correction.subtract_direct(&measured, &direct, &pair, &mut reflected, &mut scratch).expect("a reflection");
             let spectrum = correction.compute_spectrum(&reflected.samples, &mut scratch).expect("a spectrum");
             let apart = spectrum.iter().zip(&reflected.spectrum).map(|(a, b)| (a - b).norm()).fold(0.0, f64::max);
             assert!(apart < 1e-11, "{celsius} C: the spectrum is that of the samples but for {apart}");
             let reflected = reflected.samples;
             let energy = |signal: &[f64]| signal.iter().map(|x| x * x).sum::<f64>();
             let off: Vec<f64> = reflected.iter().zip(&expected).map(|(a, b)| a - b).collect();
-            let off_db = 10.0 * (energy(&off) / energy(&expected)).log10();
-            // The slope between two bins, 500 Hz apart, is not quite that of the power.
-            assert!(off_db < -75.0, "{celsius} C: {off_db} dB");
+            greatest_db = greatest_db.max(10.0 * (energy(&off) / energy(&expected)).log10());
         }
+        greatest_db
+    }
+
+    #[test]
+    fn reflections_are_those_of_the_reference_air() {
+        // The slope between two bins, 500 Hz apart, is not quite that of the power.
+        for pairs in [1, ENOUGH_PAIRS] {
+            let off_db = greatest_difference_db(smooth, pairs);
+            assert!(off_db < -75.0, "{pairs}: {off_db} dB");
+        }
+    }
+
+    // S5: a third of an octave is wider than a resonance.
+    #[test]
+    fn a_resonance_is_corrected_at_the_resolution_of_the_response() {
+        let [few, enough] = [1, ENOUGH_PAIRS].map(|pairs| greatest_difference_db(resonant, pairs));
+        assert!(enough < -52.0 && enough < few - 8.0, "{few} and {enough} dB");
     }
 
     #[test]
     fn energies_change_by_the_slope_and_by_absorption() {
-        let correction = correction();
+        let correction = correction(smooth, 1);
         let air = |celsius| AirState { temperature_c: celsius, ..REFERENCE.air() };
         let ratio = REFERENCE.time_ratio(&air(20.5)) / REFERENCE.time_ratio(&air(19.5));
         for bin in [20, 40, 150] {
@@ -512,7 +564,7 @@ mod tests {
 
     #[test]
     fn wrong_lengths_and_numbers_are_refused() {
-        let correction = correction();
+        let correction = correction(smooth, 1);
         let mut scratch = correction.make_scratch();
         let air = REFERENCE.air();
         let pair = PairAir { response: air, direct: air, direct_m: DIRECT_M, reflected_m: REFLECTED_M };

@@ -11,7 +11,6 @@ use std::collections::BTreeMap;
 use realfft::num_complex::Complex;
 
 use crate::error::check_len;
-use crate::filter_bank::FilterBankPlan;
 use crate::{Error, RealSample};
 
 /// Classes of the cosine of the angle of incidence, each a tenth wide.
@@ -93,28 +92,33 @@ impl ScatteringSums {
         Ok(())
     }
 
-    /// Computes the coefficients of each band; None without pairs.
-    pub fn band_coefficients(&self, bank: &FilterBankPlan<f64>) -> Option<Vec<BandScattering>> {
-        let whole = self.without_field(bank, None)?;
+    /// Computes the coefficients of each octave that has shares of bins; None of one without, and without pairs.
+    ///
+    /// shares  `[octaves][bins]`: of each bin's energy, what is in the octave
+    pub fn octave_coefficients(&self, shares: &[Option<Vec<f64>>]) -> Vec<Option<BandScattering>> {
+        let whole = self.octaves_without_field(shares, None);
         let mut names: Vec<u8> = self.fields.keys().map(|(_, field)| *field).collect();
         names.sort_unstable();
         names.dedup();
-        let parts: Option<Vec<_>> = names.iter().map(|field| self.without_field(bank, Some(*field))).collect();
-        let parts = parts.unwrap_or_default();
-        let number = |band: usize, of: fn(&[f64; 3]) -> f64| {
-            let values: Vec<f64> = parts.iter().map(|bands| of(&bands[band])).collect();
-            jackknife_number(of(&whole[band]), &values)
+        let parts: Vec<_> = names.iter().map(|field| self.octaves_without_field(shares, Some(*field))).collect();
+        let coefficients = |octave: usize| {
+            let all = whole[octave]?;
+            // A field that has all pairs leaves none.
+            let parts: Option<Vec<_>> = parts.iter().map(|octaves| octaves[octave]).collect();
+            let parts = parts.unwrap_or_default();
+            let number =
+                |of: fn(&[f64; 3]) -> f64| jackknife_number(of(&all), &parts.iter().map(of).collect::<Vec<_>>());
+            Some(BandScattering {
+                energy: number(|[surface, flat, _]| surface / flat),
+                scattering: number(|[surface, _, coherent]| 1.0 - coherent / surface),
+                specular_loss: number(|[_, flat, coherent]| 1.0 - coherent / flat),
+            })
         };
-        let coefficients = |band| BandScattering {
-            energy: number(band, |[surface, flat, _]| surface / flat),
-            scattering: number(band, |[surface, _, coherent]| 1.0 - coherent / surface),
-            specular_loss: number(band, |[_, flat, coherent]| 1.0 - coherent / flat),
-        };
-        Some((0..bank.band_count()).map(coefficients).collect())
+        (0..shares.len()).map(coefficients).collect()
     }
 
-    // Energies of surface and Flat and the mirrored energy in each band, from all fields but one.
-    fn without_field(&self, bank: &FilterBankPlan<f64>, omitted: Option<u8>) -> Option<Vec<[f64; 3]>> {
+    // Energies of surface and Flat and the mirrored energy in each octave, from all fields but one.
+    fn octaves_without_field(&self, shares: &[Option<Vec<f64>>], omitted: Option<u8>) -> Vec<Option<[f64; 3]>> {
         let mut classes: BTreeMap<u8, Vec<BinSums>> = BTreeMap::new();
         for ((class, _), bins) in self.fields.iter().filter(|((_, field), _)| Some(*field) != omitted) {
             let sums = classes.entry(*class).or_insert_with(|| vec![BinSums::default(); bins.len()]);
@@ -124,21 +128,17 @@ impl ScatteringSums {
                 sum.flat += bin.flat;
             }
         }
-        let powers: [fn(&BinSums) -> f64; 3] = [
-            |bin| bin.surface,
-            |bin| bin.flat,
-            |bin| if bin.flat > 0.0 { bin.product.norm_sqr() / bin.flat } else { 0.0 },
-        ];
-        let bins = classes.values().next()?.len();
-        let mut bands = vec![[0.0; 3]; bank.band_count()];
-        for (at, power) in powers.into_iter().enumerate() {
-            let sum = |bin: usize| classes.values().map(|bins| power(&bins[bin])).sum::<f64>();
-            let spectrum: Vec<Complex<f64>> = (0..bins).map(|bin| sum(bin).sqrt().into()).collect();
-            let mut energies = vec![0.0; bands.len()];
-            bank.spectrum_energies(&spectrum, &mut energies);
-            bands.iter_mut().zip(energies).for_each(|(band, energy)| band[at] = energy);
-        }
-        Some(bands)
+        let mirrored = |bin: &BinSums| if bin.flat > 0.0 { bin.product.norm_sqr() / bin.flat } else { 0.0 };
+        let energies = |shares: &Vec<f64>| {
+            let mut energies = [0.0; 3];
+            for (bin, share) in classes.values().flat_map(|bins| bins.iter().zip(shares)) {
+                let powers = [bin.surface, bin.flat, mirrored(bin)];
+                energies.iter_mut().zip(powers).for_each(|(sum, power)| *sum += share * power);
+            }
+            energies
+        };
+        let has_pairs = !classes.is_empty();
+        shares.iter().map(|octave| octave.as_ref().filter(|_| has_pairs).map(energies)).collect()
     }
 }
 
@@ -156,12 +156,15 @@ fn jackknife_number(whole: f64, without_one: &[f64]) -> UncertainNumber {
 
 #[cfg(test)]
 mod tests {
+    use echolake_schema::Rig;
+
     use super::*;
+    use crate::full_scale_octave::bin_shares_of_octaves;
 
     const BINS: usize = 193;
 
-    fn bank() -> FilterBankPlan<f64> {
-        FilterBankPlan::new(384, 96e3, &[2_500.0, 5e3, 10e3, 20e3, 40e3]).expect("a bank")
+    fn shares() -> Vec<Option<Vec<f64>>> {
+        bin_shares_of_octaves(&Rig::paper()).expect("filters")
     }
 
     // Places at random over the panel, and spectra of noise.
@@ -184,7 +187,9 @@ mod tests {
             let surface: Vec<_> = flat.iter().zip(&other).map(|(f, o)| f * mirrored + o * scattered).collect();
             sums.add_pair(&surface, &flat, path).expect("equally long");
         }
-        sums.band_coefficients(&bank()).expect("pairs")
+        let octaves = sums.octave_coefficients(&shares());
+        assert_eq!(octaves.iter().map(Option::is_some).collect::<Vec<_>>(), [false, true, true, true, false]);
+        octaves.into_iter().flatten().collect()
     }
 
     // Of independent places with a mirrored part of known size, whatever its phase.
@@ -212,7 +217,7 @@ mod tests {
             assert!(band.scattering.value.abs() < 1e-12 && band.specular_loss.value.abs() < 1e-12, "{band:?}");
             assert!((band.energy.value - 1.0).abs() < 1e-12, "{band:?}");
         }
-        assert_eq!(ScatteringSums::default().band_coefficients(&bank()), None);
+        assert_eq!(ScatteringSums::default().octave_coefficients(&shares()), [None; 5]);
     }
 
     // One place tells nothing of its uncertainty; other lengths are refused.
@@ -222,8 +227,8 @@ mod tests {
         let mut sums = ScatteringSums::default();
         let one = vec![Complex::new(1.0, 0.0); BINS];
         sums.add_pair(&one, &one, path).expect("equally long");
-        let bands = sums.band_coefficients(&bank()).expect("a pair");
-        assert_eq!(bands[2].scattering.uncertainty, None);
+        let octave = sums.octave_coefficients(&shares())[2].expect("a pair");
+        assert_eq!(octave.scattering.uncertainty, None);
         assert!(sums.add_pair(&one, &one[1..], path).is_err());
         assert!(sums.add_pair(&one[1..], &one[1..], path).is_err());
     }

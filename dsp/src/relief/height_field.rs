@@ -102,6 +102,20 @@ impl HeightField {
         lower * (1.0 - v) + upper * v
     }
 
+    /// Area of the relief over that of its plane: of the facets between the cells' centres.
+    pub fn area_ratio(&self) -> f64 {
+        let pitch = self.pitch_mm();
+        let last = self.cells - 1;
+        let facet = |ix: usize, iy: usize| {
+            let h = |i, j| f64::from(self.cell_height(i, j));
+            let [near, right, above, far] = [h(ix, iy), h(ix + 1, iy), h(ix, iy + 1), h(ix + 1, iy + 1)];
+            let triangle = |x: f64, y: f64| (1.0 + (x * x + y * y) / (pitch * pitch)).sqrt() / 2.0;
+            triangle(right - near, above - near) + triangle(far - above, far - right)
+        };
+        let sum: f64 = (0..last * last).map(|at| facet(at % last, at / last)).sum();
+        sum / (last * last) as f64
+    }
+
     /// Root mean square of the heights beside their mean over squares of this width around them, mm: of what is
     /// narrower. Squares end at the field's edges.
     pub fn detail_rms_mm(&self, width_mm: f64) -> f64 {

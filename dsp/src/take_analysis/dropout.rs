@@ -5,7 +5,8 @@ use std::ops::Range;
 use realfft::num_complex::Complex;
 
 use super::{
-    ONSET_SHARE, OnsetVicinity, RINGING_SECS, TakeAnalysis, TakeAnalyzer, TakeChannel, TakeFault, greatest_magnitude,
+    ONSET_SHARE, OnsetVicinity, ShortTransform, TakeAnalysis, TakeAnalyzer, TakeChannel, TakeFault, TransformScratch,
+    greatest_magnitude,
 };
 use crate::level::power_to_db;
 use crate::sweep::SineSweep;
@@ -17,6 +18,8 @@ const PARTS: usize = 100;
 /// Least power of a part's ringing, re the mean power of the response: a lost sample has -38 dB and more, a clean take
 /// -60 dB and less.
 const RINGING_SHARE: f64 = 3.2e-5;
+/// The same near the limits of an exponential sweep, where hum of -20 dBFS has -44 dB.
+const FINE_RINGING_SHARE: f64 = 3.2e-4;
 /// Least power of the ringing over that of the window farther before the arrival: a tone or a click has as much there.
 const OVER_FARTHER: f64 = 3.2;
 /// Least power of the ringing over the median of all parts: noise has less than 9 dB.
@@ -34,7 +37,7 @@ impl TakeAnalyzer {
     ) -> bool {
         let mut found = None;
         for vicinity in vicinities {
-            found = self.locate_dropout(vicinity);
+            found = self.locate_dropout(vicinity, &self.short, RINGING_SHARE);
             if found.is_none() {
                 return false;
             }
@@ -46,15 +49,36 @@ impl TakeAnalyzer {
         found.is_some()
     }
 
+    /// Adds a fault if an exponential sweep's recording lost samples while it was near the limits of its range, and no
+    /// other fault was found. Which of the channels it was cannot be told.
+    pub(super) fn find_fine_dropout(
+        &self,
+        analysis: &mut TakeAnalysis,
+        spectra: [&[Complex<f32>]; 2],
+        delay: i64,
+        scratch: &mut TransformScratch,
+    ) {
+        let Some((tapered, short)) = &self.fine else { return };
+        if analysis.faults.iter().any(TakeFault::spoils_response) {
+            return;
+        }
+        let range = (tapered.gains.as_slice(), &tapered.range);
+        let response = self.divide_tapered(spectra, self.forward.len() / 2, range, short, scratch);
+        if let Some((sweep_secs, ringing_db)) = self.locate_dropout(&response.vicinity, short, FINE_RINGING_SHARE) {
+            let at_secs = sweep_secs + self.secs_of(response.onset + delay);
+            analysis.faults.push(TakeFault::Dropout { channel: TakeChannel::Recording, at_secs, ringing_db });
+        }
+        scratch.judged.push((response.samples, response.powers));
+    }
+
     // Time in the sweep, s, and level of the ringing, dB.
-    fn locate_dropout(&self, vicinity: &OnsetVicinity) -> Option<(f64, f64)> {
-        let least = (ONSET_SHARE * ONSET_SHARE) as f32 * greatest_magnitude(&vicinity.powers);
-        let onset = vicinity.powers.iter().position(|x| *x >= least)?;
-        let window = self.short.window.len();
-        let guard = self.seconds(RINGING_SECS);
-        let near = self.part_powers(&self.window_spectrum(&vicinity.samples, onset, guard));
-        let farther = self.part_powers(&self.window_spectrum(&vicinity.samples, onset, guard + window * 3 / 2));
-        let mean = mean_of(&self.part_powers(&vicinity.spectrum));
+    fn locate_dropout(&self, vicinity: &OnsetVicinity, short: &ShortTransform, least: f64) -> Option<(f64, f64)> {
+        let arrived = (ONSET_SHARE * ONSET_SHARE) as f32 * greatest_magnitude(&vicinity.powers);
+        let onset = vicinity.powers.iter().position(|x| *x >= arrived)?;
+        let (window, guard) = (short.window.len(), short.guard);
+        let near = short.part_powers(&short.window_spectrum(&vicinity.samples, onset, guard));
+        let farther = short.part_powers(&short.window_spectrum(&vicinity.samples, onset, guard + window * 3 / 2));
+        let mean = mean_of(&short.part_powers(&vicinity.spectrum));
         let mut sorted: Vec<f64> = near.iter().flatten().copied().collect();
         sorted.sort_by(f64::total_cmp);
         let median = *sorted.get(sorted.len() / 2)?;
@@ -62,20 +86,21 @@ impl TakeAnalyzer {
         let ringing = near[part]?;
         let neighbours = farther[part.saturating_sub(1)..(part + 2).min(PARTS)].iter().flatten();
         let beyond = neighbours.fold(0.0, |most: f64, x| most.max(*x));
-        let is_dropout =
-            ringing > RINGING_SHARE * mean && ringing > OVER_FARTHER * beyond && ringing > OVER_MEDIAN * median;
+        let is_dropout = ringing > least * mean && ringing > OVER_FARTHER * beyond && ringing > OVER_MEDIAN * median;
         let at_secs = (part as f64 + 0.5) / PARTS as f64 * self.sweep.duration_secs;
         is_dropout.then(|| (at_secs, power_to_db(ringing / mean)))
     }
+}
 
+impl ShortTransform {
     // Spectrum of a window that ends `before` samples before the onset.
     fn window_spectrum(&self, samples: &[Complex<f32>], onset: usize, before: usize) -> Vec<Complex<f32>> {
-        let mut windowed = vec![Complex::default(); self.short.len];
-        for (i, gain) in self.short.window.iter().enumerate() {
-            let index = (onset + 2 * self.short.len - before - i) % self.short.len;
+        let mut windowed = vec![Complex::default(); self.len];
+        for (i, gain) in self.window.iter().enumerate() {
+            let index = (onset + 2 * self.len - before - i) % self.len;
             windowed[index] = samples[index] * gain;
         }
-        self.short.forward.process(&mut windowed);
+        self.forward.process(&mut windowed);
         windowed
     }
 
@@ -84,7 +109,7 @@ impl TakeAnalyzer {
         let mean = |part: &Range<usize>| {
             spectrum[part.clone()].iter().map(|z| f64::from(z.norm_sqr())).sum::<f64>() / part.len() as f64
         };
-        self.short.parts.iter().map(|part| (!part.is_empty()).then(|| mean(part))).collect()
+        self.parts.iter().map(|part| (!part.is_empty()).then(|| mean(part))).collect()
     }
 }
 

@@ -52,6 +52,12 @@ pub enum TakeFault {
         /// Time by which the recording precedes the loopback, s.
         early_secs: f64,
     },
+    /// Sound arrives before it is played: a response begins later, and lacks its direct sound.
+    #[error("sound arrives {:.2} ms before it is played: the direct sound is lost", 1e3 * early_secs)]
+    EarlyArrival {
+        /// Time by which it arrives too early, s.
+        early_secs: f64,
+    },
     /// The recording began after the sweep.
     #[error("recording began {:.1} ms after the sweep", 1e3 * lost_secs)]
     CutStart {
@@ -125,6 +131,9 @@ impl TakeFault {
             Self::UnknownSweep { .. } => "describe the played sweep under `sweep` in the rig file",
             Self::SameSignal { .. } => "are the inputs summed to mono, or is one of both not plugged in?",
             Self::Swapped { .. } => "exchange recording and loopback",
+            Self::EarlyArrival { .. } => {
+                "begin both files at the same sample, and leave the microphone's latency as it is"
+            }
             Self::CutStart { .. } | Self::CutEnd { .. } => "begin the recording before the sweep, and end it later",
             Self::NoResponse { .. } => "is the microphone on, and are both files of one take and one sampling rate?",
             Self::Dropout { .. } => "use a larger buffer of the audio interface, and record again",

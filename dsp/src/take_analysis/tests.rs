@@ -443,3 +443,135 @@ fn bins_are_turned_by_their_cycles() {
         }
     }
 }
+
+/// A take of a room at 48 kHz: a sweep of 20 Hz to 20 kHz in this time, direct sound after 300 samples, and a decay of
+/// sparse reflections by `seed`.
+struct RoomTake {
+    sweep: SineSweep,
+    channels: [Vec<f64>; 2],
+    seed: u64,
+}
+
+impl RoomTake {
+    fn new(duration_secs: f64, seed: u64) -> Self {
+        let sweep = SineSweep {
+            shape: SweepShape::Exponential,
+            rate_hz: 48e3,
+            duration_secs,
+            low_hz: 20.0,
+            high_hz: 20e3,
+            fade_secs: 0.01,
+        };
+        let mut state = seed;
+        let mut chance = || {
+            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            (state >> 11) as f64 / (1u64 << 53) as f64
+        };
+        let mut loopback = vec![0.0; 2_400];
+        loopback.extend(sweep.samples().iter().map(|x| 0.5 * x));
+        loopback.resize(loopback.len() + 33_600, 0.0);
+        let mut microphone = vec![0.0; loopback.len()];
+        let mut add = |delay: usize, gain: f64| {
+            microphone[delay..].iter_mut().zip(&loopback).for_each(|(sum, x)| *sum += gain * x);
+        };
+        add(300, 0.5);
+        for _ in 0..30 {
+            let delay = 400 + (12_000.0 * chance().powi(2)) as usize;
+            add(delay, 0.3 * (chance() - 0.5) * (-(delay as f64) / 5_000.0).exp());
+        }
+        Self { sweep, channels: [microphone, loopback], seed }
+    }
+
+    fn faults(&self, noise: f64) -> Vec<TakeFault> {
+        let [microphone, loopback] = &self.channels;
+        let microphone = single(microphone, noise, self.seed as u32 + 1);
+        let loopback = single(loopback, 1e-5, self.seed as u32 + 2);
+        let analyzer = TakeAnalyzer::new(self.sweep, loopback.len()).expect("a plan");
+        analyzer.analyze_take(&microphone, Some(&loopback)).expect("an analysis").faults
+    }
+}
+
+// S7: most of the time of a room's sweep is within 4 kHz of its lower limit.
+#[test]
+fn samples_lost_by_an_exponential_sweep_are_found_over_most_of_its_time() {
+    for share in [0.35, 0.5, 0.6, 0.75, 0.9] {
+        for count in [64, 512] {
+            let mut take = RoomTake::new(4.0, 7);
+            let at_secs = 0.05 + share * 4.0;
+            take.channels[0] = remove(&take.channels[0], (at_secs * 48e3) as usize, count);
+            let faults = take.faults(1e-4);
+            let found = faults.iter().find_map(|fault| match fault {
+                TakeFault::Dropout { at_secs, .. } => Some(*at_secs),
+                _ => None,
+            });
+            assert!(found.is_some_and(|found| (found - at_secs).abs() < 0.1), "{share} {count}: {faults:?}");
+        }
+    }
+}
+
+#[test]
+fn good_takes_of_rooms_are_not_refused() {
+    for seed in 0..200 {
+        let noise = [1e-5, 1e-4, 1e-3][seed as usize % 3];
+        let faults = RoomTake::new(1.0, seed).faults(noise);
+        assert!(!faults.iter().any(TakeFault::spoils_response), "{seed}: {faults:?}");
+    }
+}
+
+// S8: a response begins when its sweep is played, and lacks what comes before.
+#[test]
+fn sound_before_it_is_played_is_named() {
+    for shape in SHAPES {
+        let early = |samples: usize| {
+            let mut take = Take::new(shape);
+            take.microphone.drain(..samples);
+            take.microphone.resize(LEN, 0.0);
+            take.analyze().faults
+        };
+        assert_eq!(early(90), []);
+        let faults = early(200);
+        let is_early = |fault: &TakeFault| {
+            matches!(fault, TakeFault::EarlyArrival { early_secs } if
+            (early_secs * RATE_HZ - 100.0).abs() < 12.0)
+        };
+        assert!(faults.len() == 1 && is_early(&faults[0]), "{faults:?}");
+    }
+}
+
+// S6: what a response differs by after the best delay, which two clocks leave open, dB.
+fn difference_db(found: &[f32], expected: &[f32]) -> f64 {
+    let spectrum = |signal: &[f32]| {
+        let forward = f64::plan_real_forward(signal.len());
+        let mut spectrum = forward.make_output_vec();
+        let mut samples: Vec<f64> = signal.iter().map(|x| f64::from(*x)).collect();
+        forward.process(&mut samples, &mut spectrum).expect("a spectrum");
+        spectrum
+    };
+    let [found, expected] = [spectrum(found), spectrum(expected)];
+    let energy: f64 = expected.iter().map(Complex::norm_sqr).sum();
+    let step = TAU / (2 * (expected.len() - 1)) as f64;
+    let off = |delay: f64| -> f64 {
+        let bins = found.iter().zip(&expected).enumerate();
+        bins.map(|(k, (f, e))| (f * Complex::from_polar(1.0, step * k as f64 * delay) - e).norm_sqr()).sum()
+    };
+    let least = (-500..=500).map(|i| off(f64::from(i) * 0.002)).fold(f64::INFINITY, f64::min);
+    10.0 * (least / energy).log10()
+}
+
+#[test]
+fn the_clock_of_a_recording_is_undone() {
+    for shape in SHAPES {
+        let good = respond(&Take::new(shape), 1_024);
+        for ppm in [12.0, 25.0, 40.0, -30.0] {
+            let mut take = Take::new(shape).change(false, |signal| resample(signal, 1e-6 * ppm, 0.0));
+            let analysis = take.analyze();
+            assert_eq!(analysis.faults, [], "{shape:?}, {ppm} ppm");
+            let found = analysis.recording_clock_ppm.expect("it is told");
+            let before = difference_db(&respond(&take, 1_024), &good);
+            crate::temperature::stretch_recording(&mut take.microphone, found);
+            let after = difference_db(&respond(&take, 1_024), &good);
+            assert!(after < -30.0 && after < before - 8.0, "{shape:?}, {ppm} ppm: {before} and {after} dB");
+        }
+        assert_eq!(Take::new(shape).analyze().recording_clock_ppm, None);
+    }
+}

@@ -53,6 +53,16 @@ pub fn format_materials(rows: &[MaterialBand], format: MaterialFormat) -> Result
         rows.iter().try_for_each(|row| csv.serialize(row)).map_err(failed)?;
         return Ok((csv.into_inner().map_err(|e| Error::damaged("materials", e.into_error()))?, Vec::new()));
     }
+    // Octaves that the sweep does not have are in no surface's row of coefficients.
+    let is_measured = |hz: f64| rows.iter().any(|row| row.full_scale_hz == hz && row.absorption.is_some());
+    let measured: Vec<MaterialBand>;
+    let rows = match format {
+        MaterialFormat::Choras => {
+            measured = rows.iter().filter(|row| is_measured(row.full_scale_hz)).cloned().collect();
+            &measured
+        }
+        _ => rows,
+    };
     let mut materials = Map::new();
     let mut omitted = Vec::new();
     for bands in rows.chunk_by(|a, b| a.surface_id == b.surface_id) {
@@ -110,7 +120,7 @@ fn surface_material(bands: &[MaterialBand], format: MaterialFormat) -> Option<Va
         (!known.is_empty())
             .then(|| json!({ "description": description, "coeffs": coeffs, "center_freqs": center_freqs }))
     };
-    let absorption = coefficients("absorption over a board of MDF", |band| band.absorption)?;
+    let absorption = coefficients("absorption over a hard surface", |band| band.absorption)?;
     let scattering = coefficients("scattering by correlation with Flat", |band| band.scattering)?;
     Some(json!({ "energy_absorption": absorption, "scattering": scattering }))
 }

@@ -9,7 +9,7 @@ use echolake_dsp::air::AirState;
 use echolake_dsp::chain::{MeasurementParams, MeasurementPlan, MeasurementScratch, ResponseCorrection};
 use echolake_dsp::room_parameters::is_long_enough;
 use echolake_dsp::rounding::{RESPONSE_BITS, round_samples};
-use echolake_dsp::temperature::ReferenceAir;
+use echolake_dsp::temperature::{ReferenceAir, stretch_recording};
 use echolake_lake::{Lake, SamplePrecision};
 use echolake_recording::{ChunkMessage, DecodedChunk, list_damage};
 use echolake_schema::messages::{
@@ -283,6 +283,7 @@ impl Measurer {
             let MeasurementBuffers { microphone, loopback, scratch } = buffers;
             samples::decode_samples(format, &sweep.microphone, microphone).map_err(|e| e.to_string())?;
             samples::decode_samples(format, &sweep.loopback, loopback).map_err(|e| e.to_string())?;
+            stretch_recording(microphone, sweep.playing_clock_ppm());
             let of_room = match &mut measured {
                 Some(samples) => planned.plan.compute_measured(microphone, loopback, samples, scratch),
                 None => Ok(()),

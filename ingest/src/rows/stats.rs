@@ -25,8 +25,9 @@ pub(crate) struct SurfaceLevels {
     pub uncertainty: Option<LevelUncertainty>,
     /// Mean NCE curves of the bands.
     pub curves: Vec<SignalMean>,
-    /// Coefficients of the bands; none without an estimate of Foam's reflection.
-    pub scattering: Vec<BandScattering>,
+    /// Coefficients of the octaves around the bands, where the sweep has all of one; none without an estimate of Foam's
+    /// reflection.
+    pub scattering: Vec<Option<BandScattering>>,
 }
 
 /// Builds one row per band and one for the total.
@@ -53,7 +54,8 @@ pub(crate) fn stats_rows(
     }
     // The total has none.
     let numbers = |of: fn(&BandScattering) -> Option<f64>| -> Vec<Option<f64>> {
-        (0..stats.len()).map(|band| levels.scattering.get(band).and_then(of).and_then(finite_value)).collect()
+        let of_band = |band| levels.scattering.get(band).and_then(Option::as_ref);
+        (0..stats.len()).map(|band| of_band(band).and_then(of).and_then(finite_value)).collect()
     };
     let batch = keys
         .begin_rows(Table::SurfaceStats, rig, stats.len())

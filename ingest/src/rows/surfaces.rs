@@ -1,17 +1,19 @@
 //! The row of table `surfaces`.
 
-use std::f64::consts::{FRAC_1_SQRT_2, SQRT_2, TAU};
+use std::f64::consts::TAU;
 use std::sync::{Arc, Mutex, PoisonError};
 
 use arrow::record_batch::RecordBatch;
 use echolake_dsp::far_field::FarFieldPlan;
+use echolake_dsp::full_scale_octave::octave_around;
 use echolake_dsp::height_field::HeightField;
+use echolake_dsp::octave_filter::OctaveBand;
 use echolake_dsp::relief_coefficients::{ReliefCoefficients, estimate_coefficients};
 use echolake_dsp::scattering::UncertainNumber;
 use echolake_dsp::temperature::ReferenceAir;
 use echolake_lake::ReferenceSurfaces;
 use echolake_schema::tables::Table;
-use echolake_schema::{ProjectName, Rig, SurfaceId, SurfaceRecord};
+use echolake_schema::{ProjectName, Rig, SurfaceId, SurfaceRecord, SurfaceRole};
 
 use super::RunKeys;
 use crate::error::{Error, Result};
@@ -84,6 +86,7 @@ pub(crate) fn surface_row(
         .fill_text("mesostructure", surface.mesostructure.as_deref())
         .fill_text("microstructure", surface.microstructure.as_deref())
         .fill_text("material", surface.material.as_deref())
+        .fill_text("role", surface.role.map(SurfaceRole::name))
         .push_doubles("reflection_factor", [surface.reflection_factor])
         .fill_text("flat_reference", flat.as_str())
         .fill_text("foam_reference", foam.as_str())
@@ -95,6 +98,7 @@ pub(crate) fn surface_row(
         .push_floats("relief_min_mm", known(0))
         .push_floats("relief_max_mm", known(1))
         .push_floats("relief_rms_mm", known(2))
+        .push_floats("relief_area_ratio", [heights.as_ref().map(|heights| heights.area_ratio() as f32)])
         .fill_text("origin", origin)
         .fill_text("project", surface.project.as_ref().map(ProjectName::as_str))
         .finish()?;
@@ -134,15 +138,11 @@ fn compute_far_fields(
     Ok(bands.into_iter().map(of_band).collect())
 }
 
-// Wave numbers over the part of the band's octave that the sweep has, rad/m.
+// Wave numbers over the octave around a band, rad/m: what is computed from a relief needs no sweep.
 fn far_wave_numbers(heights: &HeightField, rig: &Rig, hz: f64) -> BandWaves {
     let speed_m_s = ReferenceAir::from_response(&rig.impulse_response).speed_of_sound();
-    let low_hz = rig.sweep.low_hz.max(hz * FRAC_1_SQRT_2);
-    let high_hz = rig.sweep.high_hz.min(hz * SQRT_2);
+    let OctaveBand { low_hz, high_hz, .. } = octave_around(rig, hz).unwrap_or_else(|_| OctaveBand::around(hz));
     let at = |i: usize| low_hz * (high_hz / low_hz).powf((i as f64 + 0.5) / FAR_FIELD_FREQUENCIES as f64);
-    if low_hz >= high_hz {
-        return Err("the sweep does not have the band");
-    }
     if 1e3 * speed_m_s / high_hz <= 2.0 * heights.pitch_mm() {
         return Err("the cells of the heights are half a wavelength wide, or wider");
     }

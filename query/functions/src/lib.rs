@@ -21,6 +21,7 @@ use adapters::rig::RigFacts;
 use adapters::scalar::wrap_scalar;
 use aggregates::{average, p90_mean, panel_splits, value_counts};
 use comparison::{alike, diffusion};
+pub use echolake_dsp::full_scale_octave::measured_octave;
 use geometry::{fresnel, sound, symmetry};
 use responses::{band_energy, decay, nce, octave_band, rise, room_parameters, spectrum};
 pub use standard::call_limits::{check_fixed_type, limited_functions};

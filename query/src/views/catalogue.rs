@@ -1,15 +1,28 @@
-//! `catalogue`: one row per surface, with its newest run and that run's levels.
+//! `catalogue`: one row per surface, with its newest run and the levels of all of its runs.
 
 use std::collections::HashMap;
 
 use echolake_schema::Rig;
 
-use super::{RE_FLAT_BAND, RE_FLAT_TOTAL, column_note};
+use super::{RE_FLAT_BAND, RE_FLAT_TOTAL, column_note, levels};
 
-// Column of `surface_stats`, name of its columns here, unit and meaning.
-const STATS: [(&str, &str, &str, &str); 5] = [
-    ("p90_mean_db", "level", RE_FLAT_TOTAL, "Mean of the TNCE values up to their 90th percentile"),
-    ("p90_mean_u_db", "level_u", "dB", "Standard uncertainty of level_*_db and of against_flat_*_db"),
+// Expression over view `levels`, name of its columns here, unit and meaning.
+const STATS: [(&str, &str, &str, &str); 8] = [
+    ("level_db", "level", RE_FLAT_TOTAL, "Mean of the TNCE values up to their 90th percentile"),
+    (
+        "coalesce(combined_u_db, u_db)",
+        "level_u",
+        "dB",
+        "Standard uncertainty of level_*_db and of against_flat_*_db, without Foam's bias; with repositioning if known",
+    ),
+    ("against_flat_db", "against_flat", RE_FLAT_BAND, "level_*_db less that of the surface's Flat"),
+    (
+        "shown_against_flat_db",
+        "shown_against_flat",
+        RE_FLAT_BAND,
+        "The level that pages show: without Foam's own reflection where it is known",
+    ),
+    ("shown_u_db", "shown_u", "dB", "Standard uncertainty of shown_against_flat_*_db"),
     ("p5_db", "p5", RE_FLAT_TOTAL, "5th percentile of TNCE"),
     ("p95_db", "p95", RE_FLAT_TOTAL, "95th percentile of TNCE"),
     ("spread_db", "spread", "dB", "Standard deviation of TNCE in dB over the pairs"),
@@ -29,13 +42,11 @@ pub(super) fn view_sql(rig: &Rig) -> String {
     let pivot = |(column, name, band): &(&str, String, String)| {
         format!("max(CASE WHEN band = '{band}' THEN {column} END) AS {name}")
     };
-    let own = names.iter().map(|(_, name, _)| format!("t.{name}"));
-    let against =
-        level_bands(rig).into_iter().map(|b| format!("t.level_{b}_db - f.level_{b}_db AS against_flat_{b}_db"));
-    let levels: Vec<_> = own.chain(against).collect();
+    let levels: Vec<_> = names.iter().map(|(_, name, _)| format!("t.{name}")).collect();
     let statistics = format!(
-        "(SELECT run_id, {} FROM surface_stats GROUP BY run_id)",
-        names.iter().map(pivot).collect::<Vec<_>>().join(", ")
+        "(SELECT surface_id, {} FROM ({}) GROUP BY surface_id)",
+        names.iter().map(pivot).collect::<Vec<_>>().join(", "),
+        levels::view_sql()
     );
     format!(
         "SELECT s.surface_id, s.panel, s.side, s.typology, s.macrostructure, s.mesostructure, s.microstructure, \
@@ -48,9 +59,7 @@ pub(super) fn view_sql(rig: &Rig) -> String {
          JOIN (SELECT surface_id, count(*) AS runs, CAST(sum(measurements) AS BIGINT) AS all_measurements, \
          min(started) AS first_started, max(ended) AS last_ended FROM runs GROUP BY surface_id) a \
          ON a.surface_id = s.surface_id \
-         LEFT JOIN {statistics} t ON t.run_id = s.run_id \
-         LEFT JOIN surfaces flat ON flat.surface_id = s.flat_reference \
-         LEFT JOIN {statistics} f ON f.run_id = flat.run_id",
+         LEFT JOIN {statistics} t ON t.surface_id = s.surface_id",
         levels = levels.join(", "),
     )
 }
@@ -61,17 +70,17 @@ pub(super) fn column_notes(rig: &Rig) -> HashMap<String, HashMap<String, String>
         column_note("all_measurements", "1", "Accepted measurements of all of its runs"),
         column_note("first_started", "", "Start of its first run, UTC"),
         column_note("last_ended", "", "End of its last run, UTC"),
-        column_note("run_id", "", "Its newest run; what follows is of that"),
+        column_note(
+            "run_id",
+            "",
+            "Its newest run; what follows is of that, but for levels, which are means over its runs",
+        ),
     ];
     let levels = STATS.iter().flat_map(|(_, name, unit, comment)| {
         level_bands(rig).into_iter().map(move |b| {
             let of = if b == "total" { "all bands".to_owned() } else { format!("the band at {b} Hz") };
-            column_note(format!("{name}_{b}_db"), unit, format!("{comment}, {of}, newest run"))
+            column_note(format!("{name}_{b}_db"), unit, format!("{comment}, {of}, mean over its runs"))
         })
     });
-    let against = level_bands(rig).into_iter().map(|b| {
-        let name = format!("against_flat_{b}_db");
-        column_note(name, RE_FLAT_BAND, format!("level_{b}_db less that of the surface's Flat"))
-    });
-    own.into_iter().chain(levels).chain(against).collect()
+    own.into_iter().chain(levels).collect()
 }

@@ -6,6 +6,7 @@
 mod augmented;
 mod catalogue;
 mod eager_aggregation;
+mod flat_drift;
 mod ir;
 mod lazy_view;
 mod levels;
@@ -63,6 +64,8 @@ pub(crate) enum LakeView {
     Materials,
     /// One row per surface, band and kind of level: by how much its runs differ.
     Repeatability,
+    /// One row per run of a Flat and band: a control chart.
+    FlatDrift,
 }
 
 /// Unit of levels over Flat's energy in all bands.
@@ -88,7 +91,7 @@ pub fn table_meaning(name: &str) -> Option<&'static str> {
 
 impl LakeView {
     /// All views.
-    pub const ALL: [Self; 8] = [
+    pub const ALL: [Self; 9] = [
         Self::Ir,
         Self::TnceDb,
         Self::Augmented,
@@ -97,6 +100,7 @@ impl LakeView {
         Self::RoomParameters,
         Self::Materials,
         Self::Repeatability,
+        Self::FlatDrift,
     ];
 
     /// Returns its name in SQL.
@@ -110,6 +114,7 @@ impl LakeView {
             Self::RoomParameters => "room_parameters",
             Self::Materials => "materials",
             Self::Repeatability => "repeatability",
+            Self::FlatDrift => "flat_drift",
         }
     }
 
@@ -126,12 +131,15 @@ impl LakeView {
             Self::Levels => "One row per surface and band: level and uncertainty over all of its runs.",
             Self::RoomParameters => "One row per measurement and octave: reverberation times, clarity, centre time.",
             Self::Materials => {
-                "One row per surface and band, of its newest run: absorption and scattering for simulations of rooms \
-                 at full scale (1:10), with standard uncertainties, and reasons for what is missing."
+                "One row per surface and octave, mean over its runs: absorption and scattering for simulations of rooms \
+                 at full scale, with standard uncertainties, and reasons for what is missing."
             }
             Self::Repeatability => {
                 "One row per surface, band and kind of level: repeatability and reproducibility over its runs, days \
                  and rigs (ISO 5725-2)."
+            }
+            Self::FlatDrift => {
+                "One row per run of a Flat and band: a control chart, with alarms where the rig drifted or a run differs."
             }
         }
     }
@@ -151,6 +159,7 @@ impl LakeView {
             Self::Levels | Self::Materials => &[Table::Surfaces, Table::SurfaceStats],
             Self::RoomParameters => &[Table::Measurements],
             Self::Repeatability => &[Table::Runs, Table::SurfaceStats],
+            Self::FlatDrift => &[Table::Surfaces, Table::Runs, Table::SurfaceStats],
         }
     }
 
@@ -165,6 +174,7 @@ impl LakeView {
             Self::RoomParameters => room_parameters::view_sql(lake.rig()),
             Self::Materials => materials::view_sql(lake.rig()),
             Self::Repeatability => repeatability::view_sql(),
+            Self::FlatDrift => flat_drift::view_sql(),
         }
     }
 
@@ -181,6 +191,7 @@ impl LakeView {
             Self::RoomParameters => room_parameters::column_notes(),
             Self::Materials => materials::column_notes(),
             Self::Repeatability => repeatability::column_notes(),
+            Self::FlatDrift => flat_drift::column_notes(),
         }
     }
 

@@ -15,7 +15,7 @@ pub(super) fn view_sql() -> String {
     let levels = "SELECT t.surface_id, t.band, t.band_hz, r.rig, date_trunc('day', r.started) AS day, k.kind, \
                   CASE k.kind WHEN 'measured' THEN t.p90_mean_db ELSE t.unbiased_p90_mean_db END AS level_db \
                   FROM surface_stats t JOIN runs r ON r.run_id = t.run_id \
-                  CROSS JOIN (VALUES ('measured'), ('unbiased')) AS k(kind)";
+                  CROSS JOIN (SELECT unnest(['measured', 'unbiased']) AS kind) AS k";
     let conditions = format!(
         "SELECT surface_id, band, kind, max(band_hz) AS band_hz, CAST(count(*) AS DOUBLE) AS n, avg(level_db) AS mean, \
          var_pop(level_db) * count(*) AS inner_squares FROM ({levels}) WHERE level_db IS NOT NULL \

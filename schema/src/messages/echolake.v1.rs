@@ -151,6 +151,10 @@ pub struct SweepRecording {
     pub humidity_pct: ::core::option::Option<f64>,
     #[prost(double, optional, tag = "10")]
     pub pressure_hpa: ::core::option::Option<f64>,
+    /// Rate of the clock that plays the loopback over the microphone's, less 1, in parts per million, where they are two:
+    /// the microphone's signal is stretched by it before it is divided by the loopback. Its bytes are as recorded.
+    #[prost(double, optional, tag = "11")]
+    pub playing_clock_ppm: ::core::option::Option<f64>,
 }
 /// How the samples of one channel become bytes. All are little-endian.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]

@@ -57,6 +57,7 @@ pub(super) fn surface_columns(bands: &[String]) -> Vec<Column> {
         Column::text("mesostructure", "The relief's pattern").or_null(),
         Column::text("microstructure", "The finish").or_null(),
         Column::text("material", "Material").or_null(),
+        Column::text("role", "hard: the absorption of others is measured beside it; sample: a level sample").or_null(),
         Column::double("reflection_factor", "1", "Pressure reflection factor of the simulation, if simulated")
             .or_null(),
         Column::text("flat_reference", "Surface that normalises this one"),
@@ -69,6 +70,7 @@ pub(super) fn surface_columns(bands: &[String]) -> Vec<Column> {
         Column::float("relief_min_mm", "mm", "Lowest point of the relief over the panel's reference plane").or_null(),
         Column::float("relief_max_mm", "mm", "Highest point of the relief over the panel's reference plane").or_null(),
         Column::float("relief_rms_mm", "mm", "Root mean square height of the relief about its mean").or_null(),
+        Column::float("relief_area_ratio", "1", "Area of the relief over that of its plane").or_null(),
     ]);
     columns.extend(bands.iter().map(|band| {
         let comment = format!(
@@ -397,7 +399,8 @@ pub(super) fn surface_stats() -> Vec<Column> {
         Column::double(
             "energy_over_flat",
             "1",
-            "Reflected energy over Flat's of the same band, sums over the pairs, without Foam's own reflection",
+            "Reflected energy over Flat's in the octave around the band (IEC 61260-1), sums over the pairs, without Foam's \
+             own reflection; null if the sweep begins or ends within the octave",
         )
         .or_null(),
         Column::double("energy_over_flat_u", "1", "Its standard uncertainty, the jackknife over ninths of the panel")
@@ -405,8 +408,8 @@ pub(super) fn surface_stats() -> Vec<Column> {
         Column::double(
             "scattering",
             "1",
-            "Share of the reflected energy that is not mirrored: 1 less the coherence with Flat over the places, after \
-             Mommertz (2000)",
+            "Share of the octave's reflected energy that is not mirrored: 1 less the coherence with Flat over the \
+             places, after Mommertz (2000)",
         )
         .or_null(),
         Column::double("scattering_u", "1", "Its standard uncertainty, the jackknife over ninths of the panel")
@@ -414,7 +417,7 @@ pub(super) fn surface_stats() -> Vec<Column> {
         Column::double(
             "specular_loss",
             "1",
-            "Share of Flat's energy that is not mirrored: the scattering of ISO 17497-1 of a surface that absorbs as \
+            "Share of Flat's energy in the octave that is not mirrored: the scattering of ISO 17497-1 of a surface that absorbs as \
              Flat",
         )
         .or_null(),

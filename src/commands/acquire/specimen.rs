@@ -16,6 +16,10 @@ use crate::UsageError;
 /// Returns the specimen that the arguments name. A real panel is what it is, whatever its surface is called.
 pub(super) fn choose_specimen(args: &AcquireArgs, rig: &Rig) -> anyhow::Result<PanelSpecimen> {
     let is_simulated = rig.devices.are_simulated();
+    if is_simulated && args.material.is_some() {
+        let text = "the simulated rig computes the material of its panel; hint: leave out --material";
+        return Err(UsageError(text.to_owned()).into());
+    }
     if args.no_geometry {
         let hint = "the simulated rig measures the panel's geometry; hint: leave out --no-geometry";
         anyhow::ensure!(!is_simulated, UsageError(hint.to_owned()));

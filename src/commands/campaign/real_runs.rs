@@ -100,6 +100,8 @@ impl RealRuns {
             flat: planned.flat.clone(),
             foam: planned.foam.clone(),
             macro_reference: planned.macro_reference.clone(),
+            material: None,
+            role: None,
             project: planned.project.clone(),
             start: Timestamp::now(),
             seed: planned.seed,

@@ -55,13 +55,12 @@ impl MeasuredPanel {
 pub(super) async fn read_measured(lake: &Lake, bands: &[String]) -> anyhow::Result<Vec<MeasuredPanel>> {
     let session = Session::new(lake)?;
     // Foam's own reflection is taken away from both or from none.
-    let sql = "select s.surface_id, s.origin, s.mesostructure as relief, s.parameters, t.band, \
-               coalesce(t.unbiased_p90_mean_db - f.unbiased_p90_mean_db, t.p90_mean_db - f.p90_mean_db) as level_db, \
-               t.spread_db, t.scattering from surfaces s \
-               join surface_stats t on t.run_id = s.run_id \
-               join surfaces flat on flat.surface_id = s.flat_reference \
-               join surface_stats f on f.run_id = flat.run_id and f.band = t.band \
-               where s.surface_id <> s.flat_reference and s.surface_id <> s.foam_reference and t.band_hz is not null \
+    let sql = "select s.surface_id, s.origin, s.mesostructure as relief, s.parameters, l.band, \
+               l.shown_against_flat_db as level_db, l.spread_db, t.scattering from surfaces s \
+               join levels l on l.surface_id = s.surface_id \
+               join (select surface_id, band, avg(scattering) as scattering from surface_stats \
+               group by surface_id, band) t on t.surface_id = l.surface_id and t.band = l.band \
+               where s.surface_id <> s.flat_reference and s.surface_id <> s.foam_reference and l.band_hz is not null \
                order by s.surface_id";
     let rows: Vec<FigureRow> = super::super::sql::query_rows(&session, sql).await?;
     let mut panels: BTreeMap<String, MeasuredPanel> = BTreeMap::new();

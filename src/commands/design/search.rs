@@ -200,6 +200,11 @@ impl<'a> DesignSearch<'a> {
                     return Ok(UNPRINTABLE + high - low);
                 }
                 let figures = self.simulation.compute_figures(&heights, relief.material())?;
+                ensure!(
+                    self.target.figures_misfit(&figures.bands).is_finite(),
+                    "the simulation has no level, spread or scattering of a band for {}; hint: more `pairs`",
+                    values.join(", ")
+                );
                 self.lock_state().add_candidate(DesignCandidate { values: values.clone(), bands: figures.bands })?
             }
         };
@@ -354,6 +359,10 @@ impl CandidateColumns {
         let values: Vec<String> = fields[1..=parameters].iter().map(|value| (*value).to_owned()).collect();
         target.relief_of(&values).with_context(|| format!("line {number}"))?;
         let figure = |at: usize| {
+            // A band whose octave the sweep does not have has no scattering.
+            if fields[at].is_empty() && (at - parameters).is_multiple_of(COLUMNS_PER_BAND) {
+                return Ok(f64::NAN);
+            }
             let value = fields[at].parse::<f64>().ok().filter(|value| value.is_finite());
             value.with_context(|| {
                 let column = self.header.split(',').nth(at).unwrap_or_default();
@@ -373,15 +382,15 @@ impl CandidateColumns {
 impl CandidateFile {
     // The shortest numbers that are read back exactly.
     fn append_candidate(&mut self, number: usize, candidate: &DesignCandidate) -> anyhow::Result<()> {
-        let figures = candidate.bands.iter().flat_map(|band| [band.level_db, band.spread_db, band.scattering.value]);
-        let figures: Vec<f64> = figures.collect();
         ensure!(
-            figures.iter().all(|figure| figure.is_finite()),
-            "the simulation has no level, spread or scattering of a band for {}; hint: more `pairs`",
+            candidate.bands.iter().all(|band| band.level_db.is_finite() && band.spread_db.is_finite()),
+            "the simulation has no level or spread of a band for {}; hint: more `pairs`",
             candidate.values.join(", ")
         );
+        let figures = candidate.bands.iter().flat_map(|band| [band.level_db, band.spread_db, band.scattering.value]);
+        let texts = figures.map(|figure| if figure.is_nan() { String::new() } else { figure.to_string() });
         let fields = [number.to_string()].into_iter().chain(candidate.values.clone());
-        let fields = fields.chain(figures.iter().map(f64::to_string)).chain(["simulated".to_owned()]);
+        let fields = fields.chain(texts).chain(["simulated".to_owned()]);
         let line = fields.chain(self.inputs.clone()).collect::<Vec<_>>().join(",") + "\n";
         self.file.write_all(line.as_bytes()).context("cannot write candidates.csv")
     }

@@ -18,6 +18,7 @@ struct LevelRow {
     band: String,
     level_db: Option<f64>,
     u_db: Option<f64>,
+    has_foam: bool,
 }
 
 /// A level and its standard uncertainty, dB.
@@ -27,20 +28,27 @@ struct LevelValue {
     u_db: Option<f64>,
 }
 
-/// The mean that stands for a surface's pairs in a band, by its column of `surface_stats`.
+/// The mean that stands for a surface's pairs in a band, by its columns of view `levels`.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum LevelKind {
     /// Of the TNCE values up to their 90th percentile.
     Measured,
     /// The same without Foam's own reflection.
     Unbiased,
+    /// The same without Foam's own reflection where it is known, as pages show.
+    Shown,
 }
 
 impl LevelKind {
-    fn columns(self) -> [&'static str; 2] {
-        match self {
-            Self::Measured => ["p90_mean_db", "p90_mean_u_db"],
-            Self::Unbiased => ["unbiased_p90_mean_db", "unbiased_p90_mean_u_db"],
+    // Level and uncertainty.
+    fn columns(self, over: LevelReference) -> [&'static str; 2] {
+        match (self, over) {
+            (Self::Measured, LevelReference::FlatTotal) => ["level_db", "coalesce(combined_u_db, u_db)"],
+            (Self::Measured, LevelReference::FlatBand) => ["against_flat_db", "coalesce(combined_u_db, u_db)"],
+            (Self::Unbiased, LevelReference::FlatTotal) => ["unbiased_db", "unbiased_u_db"],
+            (Self::Unbiased, LevelReference::FlatBand) => ["unbiased_against_flat_db", "unbiased_against_flat_u_db"],
+            (Self::Shown, LevelReference::FlatTotal) => ["shown_db", "shown_u_db"],
+            (Self::Shown, LevelReference::FlatBand) => ["shown_against_flat_db", "shown_u_db"],
         }
     }
 }
@@ -51,6 +59,7 @@ pub(super) struct LevelTable<'a> {
     base: Option<&'a SelectedSurface>,
     kind: LevelKind,
     over: LevelReference,
+    has_foam: bool,
     values: HashMap<(String, String), LevelValue>,
     /// The query that reads them.
     pub query: String,
@@ -68,51 +77,37 @@ impl<'a> LevelTable<'a> {
         kind: LevelKind,
         over: LevelReference,
     ) -> anyhow::Result<Self> {
-        let mut names: Vec<_> = surfaces.iter().chain(base).map(|surface| surface.surface_id.as_str()).collect();
-        if over == LevelReference::FlatBand {
-            names.extend(surfaces.iter().chain(base).map(|surface| surface.flat_reference.as_str()));
-        }
+        let names: Vec<_> = surfaces.iter().chain(base).map(|surface| surface.surface_id.as_str()).collect();
         let list: Vec<_> = names.iter().enumerate().filter(|(i, name)| !names[..*i].contains(name)).collect();
         let list: Vec<_> = list.into_iter().map(|(_, name)| quote_literal(name)).collect();
-        let [level, u] = kind.columns();
+        let [level, u] = kind.columns(over);
         let query = format!(
-            "select surface_id, band, {level} as level_db, {u} as u_db from surface_stats where surface_id in ({}) \
-             order by run_id",
+            "select surface_id, band, {level} as level_db, {u} as u_db, has_foam from levels where surface_id in ({}) \
+             order by surface_id, band_hz",
             list.join(", ")
         );
         let rows: Vec<LevelRow> = source.query_rows(&query).await?;
-        // Of several runs of a surface, the newest counts.
-        let mut values = HashMap::new();
-        for row in rows {
-            let value = row.level_db.map(|level_db| LevelValue { level_db, u_db: row.u_db });
-            let key = (row.surface_id, row.band);
-            match value {
-                Some(value) => values.insert(key, value),
-                None => values.remove(&key),
-            };
-        }
-        Ok(Self { surfaces, base, kind, over, values, query })
+        let has_foam = rows.iter().any(|row| row.has_foam);
+        let known = |row: LevelRow| {
+            let value = LevelValue { level_db: row.level_db?, u_db: row.u_db };
+            Some(((row.surface_id, row.band), value))
+        };
+        let values = rows.into_iter().filter_map(known).collect();
+        Ok(Self { surfaces, base, kind, over, has_foam, values, query })
     }
 
     fn stored_value(&self, surface: &str, band: &str) -> Option<LevelValue> {
         self.values.get(&(surface.to_owned(), band.to_owned())).copied()
     }
 
-    // The uncertainty of a level holds Flat's share, so that nothing is added for Flat; that of the estimate of Foam's
-    // reflection is each surface's own.
+    // Flat over itself is 0 dB by definition.
     fn level_value(&self, surface: &SelectedSurface, band: &str) -> Option<LevelValue> {
         let own = self.stored_value(&surface.surface_id, band)?;
         let is_flat = surface.surface_id == surface.flat_reference;
-        match (self.over, is_flat) {
-            (LevelReference::FlatBand, true) => Some(LevelValue { level_db: 0.0, u_db: None }),
-            (LevelReference::FlatTotal, true) if band == TOTAL_BAND => Some(LevelValue { u_db: None, ..own }),
-            (LevelReference::FlatTotal, _) => Some(own),
-            (LevelReference::FlatBand, false) => {
-                let flat = self.stored_value(&surface.flat_reference, band)?;
-                let flat_u = if self.kind == LevelKind::Unbiased { flat.u_db } else { Some(0.0) };
-                let u_db = own.u_db.zip(flat_u).map(|(own, flat)| own.hypot(flat));
-                Some(LevelValue { level_db: own.level_db - flat.level_db, u_db })
-            }
+        match self.over {
+            LevelReference::FlatBand if is_flat => Some(LevelValue { level_db: 0.0, u_db: None }),
+            LevelReference::FlatTotal if is_flat && band == TOTAL_BAND => Some(LevelValue { u_db: None, ..own }),
+            _ => Some(own),
         }
     }
 
@@ -169,8 +164,11 @@ impl<'a> LevelTable<'a> {
 
     /// Returns the title of the levels, with their unit.
     pub fn default_title(&self) -> String {
-        let without = if self.kind == LevelKind::Unbiased { ", without Foam\u{2019}s reflection" } else { "" };
-        LevelsFigure::default_title(&self.unit()) + without
+        match self.kind {
+            LevelKind::Measured => LevelsFigure::default_title(&self.unit()),
+            LevelKind::Unbiased => LevelsFigure::shown_title(&self.unit(), false),
+            LevelKind::Shown => LevelsFigure::shown_title(&self.unit(), self.has_foam),
+        }
     }
 
     // Levels less those of their Flat are over the same band.
@@ -188,7 +186,8 @@ pub(super) async fn write_levels(source: &FigureSource, args: &LevelsArgs) -> an
     let base = source.base_surface(args.less.as_ref()).await?;
     for group in args.output.group_surfaces(&surfaces)? {
         let over = args.reference.over.into();
-        let levels = LevelTable::read(source, group, base.as_ref(), LevelKind::Measured, over).await?;
+        let kind = if args.measured { LevelKind::Measured } else { LevelKind::Shown };
+        let levels = LevelTable::read(source, group, base.as_ref(), kind, over).await?;
         let table = levels.to_table(source);
         let figure = LevelsFigure { table, unit: levels.unit(), width_px: WIDTH_PX, with_caption: true };
         let title = args.output.title_or(|| levels.default_title());

@@ -23,6 +23,7 @@ pub(super) async fn write_table(source: &FigureSource, args: &TableArgs) -> anyh
     source.require_levels(&surfaces).await?;
     let base = source.base_surface(args.less.as_ref()).await?;
     let kind = match args.values {
+        ValuesArg::Shown => Some(LevelKind::Shown),
         ValuesArg::Levels => Some(LevelKind::Measured),
         ValuesArg::UnbiasedLevels => Some(LevelKind::Unbiased),
         ValuesArg::Energies | ValuesArg::Diffusion => None,
@@ -64,8 +65,10 @@ async fn energy_table(source: &FigureSource, surfaces: &[SelectedSurface]) -> an
     names.dedup();
     let means = band_list(rig, |band| format!("avg(tnce_{band})"));
     let list = surface_list(&names);
-    let query =
-        format!("select surface_id, {means} as means from tnce where surface_id in ({list}) group by surface_id");
+    let query = format!(
+        "select surface_id, {means} as means from tnce where surface_id in ({list}) and not is_rejected(run_id, \
+             pair_id) group by surface_id"
+    );
     let rows: Vec<SurfaceMeans> = source.query_rows(&query).await?;
     let of = |name: &str| {
         let row = rows.iter().find(|row| row.surface_id == name);

@@ -682,7 +682,8 @@ export interface paths {
         };
         /**
          * The response as 32-bit float WAV.
-         * @description The rate in its header is the rig's divided by `slowdown`: 10 gives full scale.
+         * @description The rate in its header is the rig's divided by `slowdown`. By default it is that of full scale: the rig's divided by
+         *     its scale, or undivided if the rig does not say its scale.
          */
         readonly get: operations["wav"];
         readonly put?: never;
@@ -947,9 +948,14 @@ export interface components {
             readonly p50_db: number | null;
             readonly p5_db: number | null;
             readonly p90_mean_db: number | null;
-            /** @description Standard uncertainty of `p90_mean_db`; null if it is not known. */
+            /**
+             * @description Standard uncertainty of `p90_mean_db` without Foam's bias, with repositioning if it is known; null if it is not
+             *     known.
+             */
             readonly p90_mean_u_db: number | null;
             readonly p95_db: number | null;
+            /** @description Runs that the row is a mean over. */
+            readonly runs: readonly string[];
             readonly spread_db: number | null;
             /** @description `p90_mean_db` without Foam's own reflection; null if it cannot be estimated. */
             readonly unbiased_p90_mean_db: number | null;
@@ -1147,6 +1153,8 @@ export interface components {
             readonly points: readonly components["schemas"]["Point"][];
             readonly rate_hz: number;
             readonly reference_temperature_c: number;
+            /** @description Full size over the size that is measured: 10 of models at 1:10. Null if the rig does not say it. */
+            readonly scale: number | null;
             /** @description Every surface comes from the simulated rig, or is computed for the heights of one. */
             readonly simulated: boolean;
             readonly software: string;
@@ -1199,6 +1207,8 @@ export interface components {
             /** @description The reason if there is no absorption, or whose it is. */
             readonly absorption_reason: string | null;
             readonly absorption_u: number | null;
+            /** @description The same in the measurement. */
+            readonly band_hz: number;
             /** @description Computed from the relief by Kirchhoff's approximation. */
             readonly diffusion_normalised: number | null;
             readonly diffusion_normalised_u: number | null;
@@ -1207,8 +1217,8 @@ export interface components {
             /** @description Computed from the relief. */
             readonly far_scattering: number | null;
             readonly far_scattering_u: number | null;
-            /** @description Centre of the octave, a tenth of the model's frequency. */
-            readonly full_scale_hz: number;
+            /** @description Centre of the octave at full scale; null if the rig does not say its scale. */
+            readonly full_scale_hz: number | null;
             readonly scattering: number | null;
             /** @description The reason if there is no scattering, or that it differs from the specular loss. */
             readonly scattering_reason: string | null;
@@ -1556,14 +1566,18 @@ export interface components {
             readonly against_flat_db: readonly (number | null)[];
             readonly flat_reference: string;
             readonly foam_reference: string;
+            /** @description Levels hold Foam's own reflection, which is not known. */
+            readonly has_foam: boolean;
             /**
-             * @description Mean TNCE of the values up to the 90th percentile, dB re Flat total. One value per band in the order of
-             *     `lake.bands`, the total last; null if there is no value.
+             * @description Mean TNCE of the values up to the 90th percentile, dB re Flat total, mean over the runs, without Foam's own
+             *     reflection unless `has_foam`. One value per band in the order of `lake.bands`, the total last; null if there is
+             *     no value.
              */
             readonly level_db: readonly (number | null)[];
             /**
-             * @description Standard uncertainty of `level_db` and of `against_flat_db`, dB, by noise, subtraction and air of the run and of
-             *     Flat's; null if it is not known.
+             * @description Standard uncertainty of `level_db` and of `against_flat_db`, dB, by noise, subtraction, air and the estimate of
+             *     Foam's reflection, of the runs and of Flat's, and by repositioning if both have several runs; null if it is not
+             *     known.
              */
             readonly level_u_db: readonly (number | null)[];
             readonly macrostructure: string | null;
@@ -1596,8 +1610,8 @@ export interface components {
              *     the total last; null if there is no value.
              */
             readonly flat_mean: readonly (number | null)[];
-            /** @description Flat's `unbiased_p90_mean_db`, in the same order; null if there is no value. */
-            readonly flat_unbiased_db: readonly (number | null)[];
+            /** @description Flat's `p90_mean_db`, in the same order; null if there is no value. */
+            readonly flat_measured_db: readonly (number | null)[];
             /** @description Mean over the pairs of this surface's TNCE, as `flat_mean`; null of the Foam that is subtracted. */
             readonly mean: readonly (number | null)[];
             readonly mesh_triangles: number | null;

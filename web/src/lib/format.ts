@@ -1,5 +1,7 @@
 //! Numbers and names as people read them.
 
+import type { Lake } from './api'
+
 const MINUS = '\u2212'
 
 /** A number with fixed decimals and a true minus; a dash where there is none. */
@@ -80,3 +82,17 @@ export function parameter(name: string): { label: string; unit: string } {
 
 /** A grid point as the paper names it: layer, then column and row. */
 export const pointName = (p: { layer: number; gridx: number; gridy: number }) => `${p.layer}/${p.gridx}/${p.gridy}`
+
+const hertz = (hz: number) =>
+  hz >= 1000 ? `${Number((hz / 1000).toPrecision(3))} kHz` : `${Number(hz.toPrecision(3))} Hz`
+const isModel = (lake: Lake) => lake.scale != null && lake.scale !== 1
+
+/** A band's name, with its frequency at full scale where the lake is one of models: `2.5 kHz (250 Hz)`. */
+export const bandName = (lake: Lake, band: { readonly label: string; readonly centre_hz?: number | null }) =>
+  isModel(lake) && band.centre_hz != null ? `${band.label} (${hertz(band.centre_hz / (lake.scale ?? 1))})` : band.label
+
+/** Lengths of a model at full scale, in cm, to stand behind those in mm; nothing where both are one. */
+export const atFullScale = (lake: Lake, ...mm: readonly (number | null | undefined)[]) =>
+  isModel(lake) && mm.every((one) => one != null)
+    ? ` (${mm.map((one) => fixed(((one ?? 0) * (lake.scale ?? 1)) / 10, 1)).join(' to ')} cm at 1:1)`
+    : ''

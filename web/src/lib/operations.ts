@@ -128,3 +128,18 @@ export function parseFigures(text: string): ServerFigures {
 }
 
 export const figuresNow = async (): Promise<ServerFigures> => parseFigures(await figures())
+
+export interface DriftAlarm {
+  readonly surface_id: string
+  readonly band: string
+  readonly run_id: string
+  readonly started: string
+  readonly alarm: 'shift' | 'outlier'
+  readonly size_db: number
+}
+
+export const DRIFT_QUERY = `select surface_id, band, run_id, started, alarm,
+  case alarm when 'shift' then shift_db else level_db - mean_db end as size_db
+from flat_drift
+where alarm is not null
+order by started desc, band_hz`

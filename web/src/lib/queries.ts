@@ -37,16 +37,13 @@ export const diffusionQuery = (lake: Lake, ids: readonly string[]) =>
     .map(quoted)
     .join(', ')}))\n  group by surface_id, run_id, point\n)\ngroup by surface_id order by surface_id`
 
-/** Levels re Flat total, or less Flat's level in the same band. */
+/** Levels re Flat total, or less Flat's level in the same band; percentiles are re Flat total. */
 export function statisticsQuery(ids: readonly string[], over: LevelReference): string {
-  const ofFlat = (name: string) => (name === 'unbiased_p90_mean_db' ? name : 'p90_mean_db')
-  const level = (name: string) => (over === 'flat-total' ? `s.${name}` : `s.${name} - f.${ofFlat(name)} as ${name}`)
-  const columns = ['p90_mean_db', 'unbiased_p90_mean_db', 'p5_db', 'p50_db', 'p95_db', 'min_db', 'max_db'].map(level)
-  const flat =
+  const columns =
     over === 'flat-total'
-      ? ''
-      : '\n  join surfaces flat on flat.surface_id = u.flat_reference\n  join surface_stats f on f.run_id = flat.run_id and f.band = s.band'
-  return `select s.surface_id, s.band, ${columns.join(', ')}, s.p90_mean_u_db, s.spread_db\nfrom surface_stats s join surfaces u on u.run_id = s.run_id${flat}\nwhere s.surface_id in (${ids.map(quoted).join(', ')})\norder by s.surface_id, s.band_hz`
+      ? ['shown_db', 'level_db', 'unbiased_db']
+      : ['shown_against_flat_db', 'against_flat_db', 'unbiased_against_flat_db']
+  return `select surface_id, band, ${columns.join(', ')}, shown_u_db, has_foam, runs, p5_db, p50_db, p95_db, min_db, max_db, spread_db\nfrom levels\nwhere surface_id in (${ids.map(quoted).join(', ')})\norder by surface_id, band_hz`
 }
 
 export const curvesQuery = (lake: Lake, id: string, pair?: number) =>

@@ -37,10 +37,6 @@ export const uncertaintyOf = (surface: Surface, band: number) =>
 export const tone = (value: number | null) =>
   value === null || Math.abs(value) < 0.05 ? undefined : value > 0 ? 'over' : 'under'
 
-/** Converts a level over Flat's total of a band. */
-export function levelOver(over: LevelReference, surface: Surface, band: number, total_db: number | null | undefined) {
-  if (total_db === null || total_db === undefined) return null
-  if (over === 'flat-total') return total_db
-  const [own, against] = [surface.level_db[band], surface.against_flat_db[band]]
-  return own === null || against === null ? null : total_db - (own - against)
-}
+/** The level of a surface that all pages show. */
+export const shownLevel = (over: LevelReference, surface: Surface, band: number) =>
+  over === 'flat-total' ? surface.level_db[band] : surface.against_flat_db[band]

@@ -6,8 +6,8 @@ const GAP_S = 0.35
 const LOUDNESS = 0.7
 let context: AudioContext | undefined
 
-/** Models at 1:10 are measured up to where nobody hears: they are played so many times slower. */
-export const slowdownOf = (lake: Lake) => (lake.high_hz > 20_000 ? 10 : 1)
+/** Models are played so many times slower as they are smaller; nothing is slowed down if the rig does not say its scale. */
+export const slowdownOf = (lake: Lake) => lake.scale ?? 1
 
 /** Sounds without a room, made by synthesis. */
 export const DRY_SOUNDS = ['claps', 'plucked string', 'noise'] as const

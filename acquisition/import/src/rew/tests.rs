@@ -63,7 +63,7 @@ impl RewFolder {
         let manifest = self.write("manifest.csv", text.as_bytes());
         let rig = Rig::from_toml(RIG).expect("a rig");
         let mut surfaces = read_rows(&manifest, &rig, &rig.build_grid().expect("a grid"))?;
-        Ok(surfaces.pop_first().expect("a surface").1.remove(0))
+        Ok(surfaces.pop_first().expect("a surface").1.1.remove(0))
     }
 
     fn refused(&self, response: &str, rest: &str, expected: &str) {

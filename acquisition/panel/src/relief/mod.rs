@@ -11,6 +11,7 @@ mod microstructure;
 mod parameter;
 mod primitive_root;
 mod primitives;
+mod ridges;
 mod settings;
 mod stone;
 mod stones;
@@ -21,6 +22,7 @@ pub use layered::LayeredWall;
 pub use mesostructure::StoneArrangement;
 pub use parameter::{ParameterDomain, ParameterLayer, ParameterValue, ReliefParameter};
 pub use primitive_root::PrimitiveRootDiffuser;
+pub use ridges::RidgeRelief;
 pub use settings::FULL_SCALE;
 
 pub use echolake_dsp::height_field::HeightField;
@@ -46,6 +48,8 @@ pub enum PanelRelief {
     Wood,
     /// A 2D primitive-root diffuser.
     Prd(PrimitiveRootDiffuser),
+    /// Ridges that repeat.
+    Ridges(RidgeRelief),
     /// A wall in layers, with full-scale parameters.
     Layered(LayeredWall),
 }
@@ -167,11 +171,12 @@ fn paper_names() -> String {
 
 impl PanelRelief {
     /// The names that [`PanelRelief::by_name`] knows.
-    pub const NAMES: [&'static str; 13] = [
+    pub const NAMES: [&'static str; 14] = [
         "flat",
         "foam",
         "wood",
         "prd",
+        "ridges",
         "macrostructure",
         "stretcher_bond",
         "flemish_bond",
@@ -196,6 +201,7 @@ impl PanelRelief {
             "foam" => Self::Foam,
             "wood" => Self::Wood,
             "prd" => Self::Prd(PrimitiveRootDiffuser::default()),
+            "ridges" => Self::Ridges(RidgeRelief::default()),
             _ => match StoneArrangement::ALL.into_iter().find(|m| m.name() == name) {
                 Some(mesostructure) => Self::Layered(LayeredWall::new(mesostructure)),
                 None => {
@@ -277,6 +283,7 @@ impl PanelRelief {
                 all
             }
             Self::Prd(_) => primitive_root::PARAMETERS.to_vec(),
+            Self::Ridges(_) => ridges::PARAMETERS.to_vec(),
             Self::Flat | Self::Foam | Self::Wood => Vec::new(),
         }
     }
@@ -317,6 +324,7 @@ impl PanelRelief {
                 expected: expected.to_owned(),
                 hint: parameter.about,
             })?,
+            Self::Ridges(ridges) => ridges.set_value(key, setting),
             Self::Flat | Self::Foam | Self::Wood => {}
         }
         Ok(())
@@ -337,6 +345,7 @@ impl PanelRelief {
             Self::Foam => "foam",
             Self::Wood => "wood",
             Self::Prd(_) => "prd",
+            Self::Ridges(_) => "ridges",
             Self::Layered(wall) => wall.mesostructure().name(),
         }
     }
@@ -346,6 +355,7 @@ impl PanelRelief {
         match self {
             Self::Flat | Self::Foam | Self::Wood => "reference",
             Self::Prd(_) => "primitive_root_diffuser",
+            Self::Ridges(_) => "ridges",
             Self::Layered(wall) => wall.mesostructure().typology(),
         }
     }
@@ -367,6 +377,9 @@ impl PanelRelief {
                 .map(|(key, value): (&str, serde_json::Value)| (key.to_owned(), value))
                 .into_iter()
                 .collect(),
+            Self::Ridges(ridges) => {
+                ridges.parameters().into_iter().map(|(key, value)| (key.to_owned(), value)).collect()
+            }
             Self::Layered(wall) => wall.parameters(),
         }
     }
@@ -379,6 +392,7 @@ impl PanelRelief {
                 let depths = prd.depths_mm();
                 HeightField::from_fn(PANEL_SIZE_MM, cells, |x, y| prd.height_at(&depths, x, y))
             }
+            Self::Ridges(ridges) => HeightField::from_fn(PANEL_SIZE_MM, cells, |x, _| ridges.height_at(x)),
             Self::Layered(wall) => wall.height_field(cells),
         }
     }

@@ -218,6 +218,7 @@ impl RunController<'_> {
                 temperature_c: reading.temperature_c,
                 humidity_pct: Some(air.humidity_pct),
                 pressure_hpa: Some(air.pressure_hpa),
+                playing_clock_ppm: None,
             };
             run.recorder.sweep(at, &recording)?;
         }

@@ -245,7 +245,7 @@ pub(super) async fn levels_figure(
     let figure = LevelsFigure { table, unit: over.unit().to_owned(), width_px: query.width.get() as f32, with_caption };
     let options: Vec<_> = (over == LevelReference::FlatTotal).then(|| "--over total".to_owned()).into_iter().collect();
     let notes = FigureNotes {
-        title: LevelsFigure::default_title(over.unit()),
+        title: LevelsFigure::shown_title(over.unit(), entries.iter().any(|entry| entry.surface.has_foam)),
         command: figure_command("levels", &entries, &options),
         query: BAND_STATISTICS.to_owned(),
         ..figure_notes(&request, &entries)

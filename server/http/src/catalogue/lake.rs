@@ -22,6 +22,8 @@ struct LakeDescription<'a> {
     rate_hz: f64,
     low_hz: f64,
     high_hz: f64,
+    /// Full size over the size that is measured: 10 of models at 1:10. Null if the rig does not say it.
+    scale: Option<f64>,
     ir_length: usize,
     reference_temperature_c: f64,
     /// Division of the spectra at the limits of `low_hz` and `high_hz`: `tapered`, `floored` or `literal`.
@@ -109,6 +111,7 @@ pub(super) async fn lake(Extension(request): Extension<CatalogueRequest>) -> End
         rate_hz: rig.sweep.rate_hz.get(),
         low_hz: rig.sweep.low_hz,
         high_hz: rig.sweep.high_hz,
+        scale: rig.known_scale(),
         ir_length: rig.impulse_response.length,
         reference_temperature_c: rig.impulse_response.reference_temperature_c.get(),
         division: rig.impulse_response.division.name(),

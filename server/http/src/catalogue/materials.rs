@@ -11,8 +11,10 @@ use super::request::{CatalogueRequest, SurfacePath, text_value};
 /// Coefficients of a surface in one octave at full scale; a standard uncertainty ends in `_u`.
 #[derive(Deserialize, Serialize, ToSchema)]
 struct MaterialBand {
-    /// Centre of the octave, a tenth of the model's frequency.
-    full_scale_hz: f64,
+    /// Centre of the octave at full scale; null if the rig does not say its scale.
+    full_scale_hz: Option<f64>,
+    /// The same in the measurement.
+    band_hz: f64,
     absorption: Option<f64>,
     absorption_u: Option<f64>,
     /// The reason if there is no absorption, or whose it is.
@@ -33,7 +35,7 @@ struct MaterialBand {
     far_field_reason: Option<String>,
 }
 
-const MATERIALS: &str = "select full_scale_hz, absorption, absorption_u, absorption_reason, scattering, scattering_u, \
+const MATERIALS: &str = "select full_scale_hz, band_hz, absorption, absorption_u, absorption_reason, scattering, scattering_u, \
     scattering_reason, specular_loss, specular_loss_u, cast(far_scattering as double) as far_scattering, \
     cast(far_scattering_u as double) as far_scattering_u, \
     cast(diffusion_normalised as double) as diffusion_normalised, \

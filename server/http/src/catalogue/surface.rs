@@ -38,8 +38,8 @@ struct SurfaceDetail<'a> {
     flat_mean: Vec<Option<f64>>,
     /// Mean over the pairs of this surface's TNCE, as `flat_mean`; null of the Foam that is subtracted.
     mean: Vec<Option<f64>>,
-    /// Flat's `unbiased_p90_mean_db`, in the same order; null if there is no value.
-    flat_unbiased_db: Vec<Option<f64>>,
+    /// Flat's `p90_mean_db`, in the same order; null if there is no value.
+    flat_measured_db: Vec<Option<f64>>,
 }
 
 /// Statistics of a band.
@@ -47,6 +47,8 @@ struct SurfaceDetail<'a> {
 struct BandStatistics {
     band: String,
     measurements: i64,
+    /// Runs that the row is a mean over.
+    runs: Vec<String>,
     p90_mean_db: Option<f64>,
     p5_db: Option<f64>,
     p50_db: Option<f64>,
@@ -54,7 +56,8 @@ struct BandStatistics {
     min_db: Option<f64>,
     max_db: Option<f64>,
     spread_db: Option<f64>,
-    /// Standard uncertainty of `p90_mean_db`; null if it is not known.
+    /// Standard uncertainty of `p90_mean_db` without Foam's bias, with repositioning if it is known; null if it is not
+    /// known.
     p90_mean_u_db: Option<f64>,
     /// `p90_mean_db` without Foam's own reflection; null if it cannot be estimated.
     unbiased_p90_mean_db: Option<f64>,
@@ -76,8 +79,9 @@ struct SurfaceRun {
     run_id: String,
 }
 
-const STATISTICS: &str = "select band, measurements, p90_mean_db, p5_db, p50_db, p95_db, min_db, max_db, spread_db, \
-    p90_mean_u_db, unbiased_p90_mean_db from surface_stats where surface_id = $1 order by run_id desc";
+const STATISTICS: &str = "select band, measurements, run_ids as runs, level_db as p90_mean_db, p5_db, p50_db, p95_db, \
+    min_db, max_db, spread_db, coalesce(combined_u_db, u_db) as p90_mean_u_db, unbiased_db as unbiased_p90_mean_db \
+    from levels where surface_id = $1";
 
 /// One surface with its statistics and means against Flat.
 #[utoipa::path(
@@ -88,7 +92,7 @@ const STATISTICS: &str = "select band, measurements, p90_mean_db, p5_db, p50_db,
     responses((status = 200, description = "OK", body = SurfaceDetail)),
     extensions(("x-sql" = json!([
         "the summary of /surfaces",
-        "select * from surface_stats where surface_id in ($1, $flat)",
+        "select * from levels where surface_id in ($1, $flat)",
         "select surface_id, avg(tnce_2500), ..., avg(tnce_total) from tnce where surface_id in ($1, $flat) and not \
          is_rejected(run_id, pair_id) group by surface_id",
     ])))
@@ -130,9 +134,9 @@ pub(super) async fn surface(
         let own = rows.iter().find(|row| row.surface_id == surface);
         own.map_or_else(|| vec![None; bands.len()], |row| row.means.clone())
     };
-    let mut by_band = newest_by_band(found);
-    let of_flat = newest_by_band(of_flat);
-    let unbiased = |band: &str| of_flat.get(band).and_then(|row| row.unbiased_p90_mean_db);
+    let mut by_band = rows_by_band(found);
+    let of_flat = rows_by_band(of_flat);
+    let measured = |band: &str| of_flat.get(band).and_then(|row| row.p90_mean_db);
     Ok(AnswerContent::encode_json(&SurfaceDetail {
         surface: &entry.surface,
         parameters: &entry.parameters,
@@ -145,13 +149,12 @@ pub(super) async fn surface(
         detail_phase: phases.into_iter().next().map_or_else(|| vec![None; names.len()], |row| row.phases),
         flat_mean: mean(flat),
         mean: if entry.surface.is_foam() { vec![None; bands.len()] } else { mean(id) },
-        flat_unbiased_db: bands.iter().map(|band| unbiased(&band.key)).collect(),
+        flat_measured_db: bands.iter().map(|band| measured(&band.key)).collect(),
     })?)
 }
 
-// Rows come newest run first.
-fn newest_by_band(rows: Vec<BandStatistics>) -> HashMap<String, BandStatistics> {
-    rows.into_iter().rev().map(|row| (row.band.clone(), row)).collect()
+fn rows_by_band(rows: Vec<BandStatistics>) -> HashMap<String, BandStatistics> {
+    rows.into_iter().map(|row| (row.band.clone(), row)).collect()
 }
 
 /// TNCE over the grid for one microphone point.

@@ -12,6 +12,7 @@ use echolake_dsp::kirchhoff::{FacetScattering, KirchhoffPlan, KirchhoffScratch, 
 use echolake_dsp::temperature::{ReferenceAir, speed_of_sound};
 use echolake_panel::material::{FoamLayer, SurfaceMaterial};
 use echolake_panel::relief::HeightField;
+use echolake_schema::simulation::SimulationParams;
 use echolake_schema::{Grid, Rig};
 use realfft::num_complex::Complex;
 
@@ -55,7 +56,8 @@ impl SimulatedRoom {
             plan = plan.with_directivity(transducers::microphone_directivity, transducers::speaker_directivity);
         }
         let direct = plan.spectrum_at_bins(|hz| {
-            if effects.transducer_response { transducers::on_axis_response(hz) } else { 1.0.into() }
+            let response = if effects.transducer_response { transducers::on_axis_response(hz) } else { 1.0.into() };
+            response * resonance_gain(hz, effects)
         });
         let foam =
             FoamLayer { flow_resistivity: effects.foam_flow_resistivity, thickness_mm: effects.foam_thickness_mm };
@@ -99,6 +101,16 @@ impl SimulatedRoom {
         self.plan.compute_response(&path, scratch, &mut response)?;
         Ok(response)
     }
+}
+
+// A band-pass of second order beside what passes without it.
+fn resonance_gain(hz: f64, effects: &SimulationParams) -> Complex<f64> {
+    if effects.resonance_hz == 0.0 {
+        return 1.0.into();
+    }
+    let ratio = hz / effects.resonance_hz;
+    let damping = Complex::new(0.0, ratio / effects.resonance_q);
+    1.0 + 2.0 * damping / (1.0 - ratio * ratio + damping)
 }
 
 fn multiply_spectra(a: &[Complex<f32>], b: &[Complex<f32>]) -> Vec<Complex<f32>> {

@@ -34,14 +34,18 @@ pub(crate) struct SurfaceSummary {
     relief_min_mm: Option<f64>,
     relief_max_mm: Option<f64>,
     pub relief_rms_mm: Option<f64>,
-    /// Mean TNCE of the values up to the 90th percentile, dB re Flat total. One value per band in the order of
-    /// `lake.bands`, the total last; null if there is no value.
+    /// Mean TNCE of the values up to the 90th percentile, dB re Flat total, mean over the runs, without Foam's own
+    /// reflection unless `has_foam`. One value per band in the order of `lake.bands`, the total last; null if there is
+    /// no value.
     pub level_db: Vec<Option<f64>>,
     /// `level_db` less that of the surface's Flat.
     pub against_flat_db: Vec<Option<f64>>,
-    /// Standard uncertainty of `level_db` and of `against_flat_db`, dB, by noise, subtraction and air of the run and of
-    /// Flat's; null if it is not known.
+    /// Standard uncertainty of `level_db` and of `against_flat_db`, dB, by noise, subtraction, air and the estimate of
+    /// Foam's reflection, of the runs and of Flat's, and by repositioning if both have several runs; null if it is not
+    /// known.
     pub level_u_db: Vec<Option<f64>>,
+    /// Levels hold Foam's own reflection, which is not known.
+    pub has_foam: bool,
     /// Standard deviation of the pairs' TNCE in dB, by band as `level_db`.
     pub spread_db: Vec<Option<f64>>,
 }
@@ -131,8 +135,10 @@ fn decimal<'de, D: Deserializer<'de>>(column: D) -> Result<Option<f64>, D::Error
 pub(crate) struct BandStatistic {
     surface_id: String,
     band: String,
-    p90_mean_db: Option<f64>,
-    p90_mean_u_db: Option<f64>,
+    shown_db: Option<f64>,
+    shown_against_flat_db: Option<f64>,
+    shown_u_db: Option<f64>,
+    has_foam: bool,
     spread_db: Option<f64>,
 }
 
@@ -146,7 +152,7 @@ pub(crate) const SURFACES: &str = "select s.surface_id, s.run_id, s.panel, s.sid
     r.started_ns from surfaces s left join runs r on r.run_id = s.run_id order by s.surface_id, s.run_id";
 /// The query of [`BandStatistic`].
 pub(crate) const BAND_STATISTICS: &str =
-    "select surface_id, band, p90_mean_db, p90_mean_u_db, spread_db from surface_stats order by surface_id, run_id";
+    "select surface_id, band, shown_db, shown_against_flat_db, shown_u_db, has_foam, spread_db from levels";
 
 impl CatalogueSummary {
     /// The surfaces of the rows of [`SURFACES`] with the statistics of [`BAND_STATISTICS`].
@@ -170,13 +176,8 @@ impl CatalogueSummary {
 }
 
 fn surface_entry(row: SurfaceRow, levels: &SurfaceLevels, bands: &[BandDescription]) -> SurfaceEntry {
-    let statistics = |surface: &str| -> Vec<_> {
-        let own = levels.get(surface);
-        bands.iter().map(|band| own.and_then(|own| own.get(&band.key))).collect()
-    };
-    let own = statistics(&row.surface_id);
-    let flat = statistics(&row.flat_reference);
-    let against = own.iter().zip(&flat).map(|(own, flat)| Some((*own)?.p90_mean_db? - (*flat)?.p90_mean_db?)).collect();
+    let of_surface = levels.get(&row.surface_id);
+    let own: Vec<_> = bands.iter().map(|band| of_surface.and_then(|own| own.get(&band.key))).collect();
     let parameters = row.parameters.unwrap_or_default();
     let some = |text: &Option<String>| text.clone().unwrap_or_default();
     let words = [
@@ -213,9 +214,10 @@ fn surface_entry(row: SurfaceRow, levels: &SurfaceLevels, bands: &[BandDescripti
             relief_min_mm: row.relief_min_mm,
             relief_max_mm: row.relief_max_mm,
             relief_rms_mm: row.relief_rms_mm,
-            level_db: own.iter().map(|own| (*own)?.p90_mean_db).collect(),
-            against_flat_db: against,
-            level_u_db: own.iter().map(|own| (*own)?.p90_mean_u_db).collect(),
+            level_db: own.iter().map(|own| (*own)?.shown_db).collect(),
+            against_flat_db: own.iter().map(|own| (*own)?.shown_against_flat_db).collect(),
+            level_u_db: own.iter().map(|own| (*own)?.shown_u_db).collect(),
+            has_foam: own.iter().flatten().any(|own| own.has_foam),
             spread_db: own.iter().map(|own| (*own)?.spread_db).collect(),
         },
     }
