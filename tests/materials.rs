@@ -86,7 +86,7 @@ mod slow {
             let reason = "that of Flat, which is of the same material; uncertain by the area of the relief";
             assert_eq!(row["absorption_reason"], reason);
             // Joints of the wall make its area larger: S10 of a relief that had Flat's uncertainty.
-            assert!(number(row, "absorption_u") > 2.0 * number(flat, "absorption_u"), "{row} {flat}");
+            assert!(number(row, "absorption_u") > 1.1 * number(flat, "absorption_u"), "{row} {flat}");
         }
 
         place.ok(&["export", "materials", "--format", "pyroomacoustics", "--surfaces", "flat", "-o", "flat.json"]);

@@ -324,7 +324,8 @@ impl TakeAnalyzer {
         // Drifts and lost samples spread a response, and more of it comes early.
         let early_secs = -self.secs_of(response.onset);
         let is_spoiled = analysis.faults.iter().any(TakeFault::spoils_response);
-        if !is_spoiled && early_secs > EARLY_SECS && response.peak_db() >= PEAK_DB {
+        let is_known = !is_spoiled && analysis.loopback_match_db >= MATCH_DB && response.peak_db() >= PEAK_DB;
+        if is_known && early_secs > EARLY_SECS {
             analysis.faults.push(TakeFault::EarlyArrival { early_secs });
         }
         scratch.judged.extend([electrical, response].map(|judged| (judged.samples, judged.powers)));
