@@ -432,9 +432,12 @@ await check('surfaces are compared with Flat, or with the chosen one', async () 
   await page.getByText(`▲ louder than ${flat}`).waitFor()
   await chosen.selectOption(other.surface_id)
   await page.waitForURL(new RegExp(`less=${other.surface_id}`))
-  const level = all.items.find((s) => s.surface_id === id).against_flat_db[0] - other.against_flat_db[0]
+  const own = all.items.find((s) => s.surface_id === id)
+  const level = own.against_flat_db[0] - other.against_flat_db[0]
+  const unsure = Math.abs(level) <= 1.96 * Math.hypot(own.level_u_db[0], other.level_u_db[0])
   const cell = page.locator('section[aria-label="Levels by band"] tbody tr').first().locator('td').nth(1)
-  const step = `${level < -0.05 ? '▼−' : level >= 0.05 ? '▲+' : ''}${Math.abs(level).toFixed(1)}`
+  const [louder, quieter] = unsure ? ['≈', '≈'] : ['▲', '▼']
+  const step = `${level < -0.05 ? `${quieter}−` : level >= 0.05 ? `${louder}+` : ''}${Math.abs(level).toFixed(1)}`
   await eventually(async () => assert.ok((await cell.innerText()).trim().endsWith(step), await cell.innerText()))
   await page.getByRole('button', { name: `Minus ${other.surface_id}` }).click()
   await page.locator('p', { hasText: new RegExp(`^${id} minus ${other.surface_id}$`) }).waitFor()
