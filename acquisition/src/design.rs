@@ -201,8 +201,14 @@ mod tests {
         let heights = flat.height_field(echolake_panel::mesh::FACETS);
         let figures = simulation.compute_figures(&heights, flat.material()).expect("figures");
         assert_eq!(figures.bands.len(), 5);
-        for band in &figures.bands {
-            assert!(band.level_db.abs() < 1e-9 && band.scattering.value.abs() < 1e-9, "{band:?}");
+        for (number, band) in figures.bands.iter().enumerate() {
+            assert!(band.level_db.abs() < 1e-9, "{band:?}");
+            // The sweep has a part of the first octave and of the last.
+            let is_whole = (1..4).contains(&number);
+            assert!(
+                if is_whole { band.scattering.value.abs() < 1e-9 } else { band.scattering.value.is_nan() },
+                "{band:?}"
+            );
         }
         assert!(figures.levels_db.iter().flatten().all(|level| level.abs() < 1e-9));
     }
@@ -214,7 +220,7 @@ mod tests {
         waves.set_parameter("macro_depth_mm", "120").expect("a parameter");
         let heights = waves.height_field(echolake_panel::mesh::FACETS);
         let figures = simulation(60).compute_figures(&heights, waves.material()).expect("figures");
-        let [lowest, highest] = [0, 4].map(|band| figures.bands[band]);
+        let [lowest, highest] = [1, 3].map(|band| figures.bands[band]);
         assert!(lowest.scattering.value < 0.5 && highest.scattering.value > 0.7, "{figures:?}");
         assert!(highest.spread_db > lowest.spread_db, "{figures:?}");
     }
