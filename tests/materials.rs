@@ -21,7 +21,7 @@ fn brick_lake() -> TestFolder {
 
 const PART_OF_SWEEP: &str = "the sweep begins or ends within the octave";
 
-/// Whether a sweep from 2 to 40 kHz has all of the octave.
+/// Returns true if a sweep from 2 to 40 kHz has all of the octave.
 fn is_whole(row: &Value) -> bool {
     ["5000", "10000", "20000"].iter().any(|band| row["band"] == *band)
 }
@@ -111,7 +111,7 @@ mod slow {
 
     // S9: the scale is said, and what a panel does to a wave does not depend on it.
     #[test]
-    fn a_scale_is_said_or_nothing_is_told_at_full_scale() {
+    fn a_scale_is_said_or_nothing_is_given_at_full_scale() {
         let materials = |scale: &str| {
             let place = TestFolder::new();
             let rig = std::fs::read_to_string(place.path("rig.toml")).expect("a rig");

@@ -76,8 +76,8 @@ pub struct TakeAnalysis {
     /// and of the recording against the loopback if that is a digital copy of the sweep.
     /// NaN if neither shows the sweep.
     pub clock_ratio_ppm: f64,
-    /// The same of the loopback, which is a digital copy of the sweep, against the recording, where it can be told from
-    /// dispersion: the recording is to be stretched by it.
+    /// The same of the loopback, which is a digital copy of the sweep, against the recording, if it can be distinguished
+    /// from dispersion: the recording is to be stretched by it.
     pub recording_clock_ppm: Option<f64>,
     /// Distortion of the recording by order; None if the sweep is linear, or not in the recording.
     pub distortion: Option<TakeDistortion>,
@@ -109,8 +109,7 @@ pub struct TakeAnalyzer {
     /// Of exponential sweeps: gains of bins and transforms for lost samples near the limits of the range.
     fine: Option<(TaperedRange, ShortTransform)>,
     played: Vec<Complex<f32>>,
-    taper: Vec<f32>,
-    range: Range<usize>,
+    tapered: TaperedRange,
     /// Squares of these bins' gains over the played sweep's powers.
     copy_weights: Vec<f64>,
 }
@@ -211,20 +210,20 @@ impl TakeAnalyzer {
             let short = ((sweep.rate_hz * secs) as usize).next_power_of_two().min(n);
             (tapered(TAPER_HZ / FINE_PARTS), ShortTransform::new(&sweep, short, FINE_PARTS))
         });
-        let TaperedRange { gains: taper, range } = tapered(TAPER_HZ);
+        let tapered = tapered(TAPER_HZ);
+        let TaperedRange { gains, range } = &tapered;
         let weight = |(gain, bin): (&f32, &Complex<f32>)| f64::from(*gain).powi(2) / widen(*bin).norm_sqr();
         Ok(Self {
             short: ShortTransform::new(&sweep, short, 1.0),
             fine,
             inverse: f32::plan_fft(n, FftDirection::Inverse),
             real_inverse: f32::plan_real_inverse(n),
-            copy_weights: taper[range.clone()].iter().zip(&played[range.clone()]).map(weight).collect(),
-            range,
+            copy_weights: gains[range.clone()].iter().zip(&played[range.clone()]).map(weight).collect(),
             sweep,
             recording_len,
             forward,
             played,
-            taper,
+            tapered,
         })
     }
 
@@ -430,7 +429,7 @@ impl TakeAnalyzer {
         let mut turns: [Complex<f64>; LANES] = std::array::from_fn(turn);
         let mut products = [Complex::<f64>::default(); LANES];
         let mut energies = [0.0; LANES];
-        let range = self.range.clone();
+        let range = self.tapered.range.clone();
         let bins = lane_groups(&spectrum[range.clone()]).zip(lane_groups(&self.played[range]));
         for ((of, by), weights) in bins.zip(lane_groups(&self.copy_weights)) {
             for lane in 0..LANES {
@@ -441,7 +440,7 @@ impl TakeAnalyzer {
             }
         }
         let product: Complex<f64> = products.iter().sum();
-        let energies = [energies.iter().sum::<f64>(), crate::energy::energy(&self.taper)];
+        let energies = [energies.iter().sum::<f64>(), crate::energy::energy(&self.tapered.gains)];
         1.0 - product.norm_sqr() / (energies[0] * energies[1]) < DIGITAL_COPY_SHARE
     }
 
@@ -489,24 +488,23 @@ impl TakeAnalyzer {
         latest: usize,
         scratch: &mut TransformScratch,
     ) -> SweepResponse {
-        self.divide_tapered([of, by], latest, (&self.taper, &self.range), &self.short, scratch)
+        self.divide_tapered([of, by], latest, (&self.tapered, &self.short), scratch)
     }
 
     fn divide_tapered(
         &self,
         [of, by]: [&[Complex<f32>]; 2],
         latest: usize,
-        (taper, range): (&[f32], &Range<usize>),
-        short: &ShortTransform,
+        (tapered, short): (&TaperedRange, &ShortTransform),
         scratch: &mut TransformScratch,
     ) -> SweepResponse {
         let n = self.forward.len();
         let (mut samples, mut powers) = scratch.judged.pop().unwrap_or_default();
-        let range = range.clone();
+        let range = tapered.range.clone();
         samples.resize(n, Complex::default());
         samples[..range.start].fill(Complex::default());
         samples[range.end..].fill(Complex::default());
-        let bins = of[range.clone()].iter().zip(&by[range.clone()]).zip(&taper[range.clone()]);
+        let bins = of[range.clone()].iter().zip(&by[range.clone()]).zip(&tapered.gains[range.clone()]);
         for (to, ((of, by), gain)) in samples[range].iter_mut().zip(bins) {
             *to = divide_bin(of, by, gain / n as f32);
         }
@@ -536,7 +534,7 @@ impl TakeAnalyzer {
 
     // Energy of a response that is one sample of 1.
     fn unit_energy(&self) -> f64 {
-        crate::energy::energy(&self.taper) / self.forward.len() as f64
+        crate::energy::energy(&self.tapered.gains) / self.forward.len() as f64
     }
 
     // Energy within 0.5 ms of the greatest peaks over that of all other samples, dB.
@@ -604,8 +602,8 @@ impl TakeAnalyzer {
 }
 
 impl ShortTransform {
-    // For tapers that are `parts` times narrower, and windows as many times longer: then of frequencies alone at which the
-    // wide tapers leave less than a half.
+    // For tapers that are `parts` times narrower, and windows as many times longer: then of frequencies alone at which
+    // the wide tapers leave less than a half.
     fn new(sweep: &SineSweep, len: usize, parts: f64) -> Self {
         let step_hz = sweep.rate_hz / len as f64;
         let gain = |k: &usize| taper_gain(sweep, *k as f64 * step_hz, TAPER_HZ / parts);

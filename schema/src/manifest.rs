@@ -103,7 +103,7 @@ pub struct SurfaceRecord {
     pub microstructure: Option<String>,
     /// Material, as `coated print`.
     pub material: Option<String>,
-    /// What its level stands for in the absorption of other surfaces.
+    /// Its part in the measurement of absorption.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub role: Option<SurfaceRole>,
     /// Pressure reflection factor that a simulation used.
@@ -122,7 +122,7 @@ pub struct SurfaceRecord {
     pub mesh: Option<MeshFacts>,
 }
 
-/// What a level surface is measured for.
+/// Purpose of a level surface in the measurement of absorption.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum SurfaceRole {

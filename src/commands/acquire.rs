@@ -78,7 +78,7 @@ pub(crate) struct AcquireArgs {
     /// Material of the panel, for its absorption; a simulated rig knows it.
     #[arg(long, value_name = "NAME")]
     pub material: Option<String>,
-    /// What a level surface is measured for: hard (the absorption of others is measured beside it), or sample.
+    /// Purpose of a level surface: hard (the absorption of others is measured beside it), or sample.
     #[arg(long, value_name = "hard|sample")]
     pub role: Option<SurfaceRole>,
     /// Project that the surface belongs to; tokens of the query service may be limited to projects.

@@ -140,7 +140,7 @@ pub(crate) struct TableArgs {
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 enum ValuesArg {
-    /// Levels as pages show them: without Foam's own reflection where it is known, with their standard uncertainty.
+    /// Levels as pages show them: without Foam's own reflection if it is known, with their standard uncertainty.
     Shown,
     /// Mean of the TNCE values up to their 90th percentile, in dB, with its standard uncertainty; as in the paper, it
     /// holds Foam's own reflection.

@@ -40,7 +40,7 @@ type OpenManifest = (csv::Reader<BoundedFile>, Vec<Option<usize>>);
 /// Rows of a manifest by surface, with what they say of it.
 pub(crate) type SurfaceRows<R> = BTreeMap<SurfaceId, (SurfaceFacts, Vec<R>)>;
 
-/// What a manifest says of a surface in one row or more.
+/// Material and role of a surface, as a manifest says them in one row or more.
 #[derive(Debug, Default)]
 pub(crate) struct SurfaceFacts {
     material: Option<String>,

@@ -51,7 +51,7 @@ pub struct RunRequest<'a> {
     pub macro_reference: Option<SurfaceId>,
     /// Its material, if it is not that of the specimen.
     pub material: Option<String>,
-    /// What its level stands for in the absorption of other surfaces.
+    /// Its part in the measurement of absorption.
     pub role: Option<SurfaceRole>,
     /// The project that it belongs to.
     pub project: Option<ProjectName>,

@@ -38,7 +38,7 @@ pub enum OctaveGap {
 pub fn octave_around(rig: &Rig, centre_hz: f64) -> Result<OctaveBand, OctaveGap> {
     let scale = rig.known_scale().ok_or(OctaveGap::UnknownScale)?;
     let octave = OctaveBand::from_nominal(centre_hz / scale, BandWidth::Octave).ok_or(OctaveGap::NoOctave)?;
-    Ok(OctaveBand::around(octave.midband_hz * scale))
+    Ok(OctaveBand::from_midband(octave.midband_hz * scale, BandWidth::Octave))
 }
 
 /// Returns the same octave if a rig's sweep has all of it.

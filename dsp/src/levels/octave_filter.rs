@@ -99,13 +99,12 @@ impl OctaveBand {
         let steps = ((nominal_hz / REFERENCE_HZ).log10() / width.decades()).round();
         let midband_hz = REFERENCE_HZ * 10f64.powf(steps * width.decades());
         let is_near = (nominal_hz / midband_hz - 1.0).abs() < NOMINAL_TOLERANCE;
-        let half = 10f64.powf(width.decades() / 2.0);
-        is_near.then(|| Self { midband_hz, low_hz: midband_hz / half, high_hz: midband_hz * half })
+        is_near.then(|| Self::from_midband(midband_hz, width))
     }
 
-    /// Returns the octave whose midband frequency is this one, Hz.
-    pub fn around(midband_hz: f64) -> Self {
-        let half = 10f64.powf(OCTAVE_DECADES / 2.0);
+    /// Returns the band with this midband frequency, exact or not, Hz.
+    pub fn from_midband(midband_hz: f64, width: BandWidth) -> Self {
+        let half = 10f64.powf(width.decades() / 2.0);
         Self { midband_hz, low_hz: midband_hz / half, high_hz: midband_hz * half }
     }
 

@@ -14,6 +14,7 @@ use crate::air::{AirAbsorption, AirState};
 use crate::error::check_len;
 use crate::foam::subtract_foam;
 use crate::temperature::ReferenceAir;
+use crate::uncertainty::LEAST_PAIRS;
 use crate::{Error, RealSample};
 
 /// Natural logarithm of an amplitude ratio per dB.
@@ -30,13 +31,11 @@ const INVERSE_FACTORIALS: [f64; 9] =
 /// Greatest number whose exponential is computed by them, within 1.1e-11.
 const SERIES_LIMIT: f64 = 0.25;
 
-/// Half of the width that slopes are smoothed over, as a ratio of frequencies: a third of an octave in all, if there are
-/// too few pairs for other sound to average out.
+/// Half of the width that slopes are smoothed over, as a ratio of frequencies: a third of an octave in all, if there
+/// are too few pairs for other sound to average out.
 const SMOOTHED_RATIO: f64 = 1.122_462_048_309_373;
 /// The same with enough pairs, Hz: a resonance of a tweeter is wider, and noise beside it hardly counts.
 const SMOOTHED_HZ: f64 = 250.0;
-/// Pairs that are enough.
-const ENOUGH_PAIRS: usize = 24;
 
 /// Learns the slopes of speaker and microphone from the direct sound and from what Flat reflects.
 ///
@@ -110,7 +109,7 @@ impl<T: RealSample> AirCorrectionFit<T> {
             let metres = path.metres / self.pairs.max(1) as f64;
             let bins = path.spectrum.iter().zip(&absorption);
             let emitted: Vec<_> = bins.map(|(x, nepers)| x * (metres * nepers).exp()).collect();
-            let half_width = (self.pairs >= ENOUGH_PAIRS).then(|| (SMOOTHED_HZ / step_hz).round().max(1.0) as usize);
+            let half_width = (self.pairs >= LEAST_PAIRS).then(|| (SMOOTHED_HZ / step_hz).round().max(1.0) as usize);
             spectral_slopes(&emitted, step_hz, self.range_hz, half_width)
         };
         let reflected_slopes = slopes(&self.reflected);
@@ -393,8 +392,8 @@ fn transform<T: RealSample>(
     if is_finite { Ok(()) } else { Err(Error::NotFinite { what: "the response" }) }
 }
 
-// d ln(spectrum) / d ln(frequency) between neighbours within the range that the sweep has, smoothed over so many bins to
-// either side, or over a third of an octave; beyond the range the nearest one's.
+// d ln(spectrum) / d ln(frequency) between neighbours within the range that the sweep has, smoothed over so many bins
+// to either side, or over a third of an octave; beyond the range the nearest one's.
 fn spectral_slopes(
     spectrum: &[Complex<f64>],
     step_hz: f64,
@@ -517,7 +516,7 @@ mod tests {
     #[test]
     fn reflections_are_those_of_the_reference_air() {
         // The slope between two bins, 500 Hz apart, is not quite that of the power.
-        for pairs in [1, ENOUGH_PAIRS] {
+        for pairs in [1, LEAST_PAIRS] {
             let off_db = greatest_difference_db(smooth, pairs);
             assert!(off_db < -75.0, "{pairs}: {off_db} dB");
         }
@@ -526,7 +525,7 @@ mod tests {
     // S5: a third of an octave is wider than a resonance.
     #[test]
     fn a_resonance_is_corrected_at_the_resolution_of_the_response() {
-        let [few, enough] = [1, ENOUGH_PAIRS].map(|pairs| greatest_difference_db(resonant, pairs));
+        let [few, enough] = [1, LEAST_PAIRS].map(|pairs| greatest_difference_db(resonant, pairs));
         assert!(enough < -52.0 && enough < few - 8.0, "{few} and {enough} dB");
     }
 

@@ -62,8 +62,7 @@ impl TakeAnalyzer {
         if analysis.faults.iter().any(TakeFault::spoils_response) {
             return;
         }
-        let range = (tapered.gains.as_slice(), &tapered.range);
-        let response = self.divide_tapered(spectra, self.forward.len() / 2, range, short, scratch);
+        let response = self.divide_tapered(spectra, self.forward.len() / 2, (tapered, short), scratch);
         if let Some((sweep_secs, ringing_db)) = self.locate_dropout(&response.vicinity, short, FINE_RINGING_SHARE) {
             let at_secs = sweep_secs + self.secs_of(response.onset + delay);
             analysis.faults.push(TakeFault::Dropout { channel: TakeChannel::Recording, at_secs, ringing_db });

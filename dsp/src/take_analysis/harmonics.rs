@@ -57,7 +57,7 @@ impl TakeAnalyzer {
             let range = window(order);
             let lowest = order as f64 * self.sweep.low_hz;
             let step = self.sweep.rate_hz / response.samples.len() as f64;
-            let gains = self.taper.iter().enumerate().filter(|(k, _)| *k as f64 * step >= lowest);
+            let gains = self.tapered.gains.iter().enumerate().filter(|(k, _)| *k as f64 * step >= lowest);
             let width: f64 = gains.map(|(_, gain)| f64::from(*gain).powi(2)).sum();
             let expected_noise = noise * (range.end - range.start) as f64;
             ((response.energy_of(range) - expected_noise) / width, expected_noise / width)

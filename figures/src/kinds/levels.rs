@@ -46,7 +46,7 @@ impl LevelsFigure {
         format!("Mean TNCE of the values up to the 90th percentile, {unit}")
     }
 
-    /// Returns the title of levels without Foam's own reflection, or with it where it is not known.
+    /// Returns the title of levels without Foam's own reflection, or with it if it is not known.
     pub fn shown_title(unit: &str, has_foam: bool) -> String {
         let without = if has_foam { "with Foam\u{2019}s reflection" } else { "without Foam\u{2019}s reflection" };
         format!("Mean TNCE of the values up to the 90th percentile, {without}, {unit}")

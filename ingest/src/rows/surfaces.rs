@@ -7,7 +7,7 @@ use arrow::record_batch::RecordBatch;
 use echolake_dsp::far_field::FarFieldPlan;
 use echolake_dsp::full_scale_octave::octave_around;
 use echolake_dsp::height_field::HeightField;
-use echolake_dsp::octave_filter::OctaveBand;
+use echolake_dsp::octave_filter::{BandWidth, OctaveBand};
 use echolake_dsp::relief_coefficients::{ReliefCoefficients, estimate_coefficients};
 use echolake_dsp::scattering::UncertainNumber;
 use echolake_dsp::temperature::ReferenceAir;
@@ -141,7 +141,8 @@ fn compute_far_fields(
 // Wave numbers over the octave around a band, rad/m: what is computed from a relief needs no sweep.
 fn far_wave_numbers(heights: &HeightField, rig: &Rig, hz: f64) -> BandWaves {
     let speed_m_s = ReferenceAir::from_response(&rig.impulse_response).speed_of_sound();
-    let OctaveBand { low_hz, high_hz, .. } = octave_around(rig, hz).unwrap_or_else(|_| OctaveBand::around(hz));
+    let OctaveBand { low_hz, high_hz, .. } =
+        octave_around(rig, hz).unwrap_or_else(|_| OctaveBand::from_midband(hz, BandWidth::Octave));
     let at = |i: usize| low_hz * (high_hz / low_hz).powf((i as f64 + 0.5) / FAR_FIELD_FREQUENCIES as f64);
     if 1e3 * speed_m_s / high_hz <= 2.0 * heights.pitch_mm() {
         return Err("the cells of the heights are half a wavelength wide, or wider");

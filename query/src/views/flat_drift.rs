@@ -72,8 +72,8 @@ pub(super) fn column_notes() -> HashMap<String, HashMap<String, String>> {
         column_note(
             "alarm",
             "",
-            "shift: the level is another from this run on, by over 5 standard errors; outlier: this run alone is over 5 \
-             standard deviations away; null if neither",
+            "shift: the level is another from this run on, by over 5 standard errors; outlier: this run alone is over \
+             5 standard deviations away; null if neither",
         ),
     ];
     noted.into_iter().collect()

@@ -27,7 +27,8 @@ pub(super) fn view_sql() -> String {
          l.unbiased_db - f.unbiased_db AS unbiased_against_flat_db, \
          CASE WHEN l.surface_id = s.flat_reference THEN l.unbiased_u_db \
          ELSE sqrt(l.unbiased_u_db * l.unbiased_u_db + f.unbiased_u_db * f.unbiased_u_db) END AS both_unbiased_u_db, \
-         l.measurements, l.p5_db, l.p50_db, l.p95_db, l.min_db, l.max_db, l.spread_db, s.origin FROM surfaces s JOIN ({runs}) l ON l.surface_id = s.surface_id \
+         l.measurements, l.p5_db, l.p50_db, l.p95_db, l.min_db, l.max_db, l.spread_db, s.origin \
+         FROM surfaces s JOIN ({runs}) l ON l.surface_id = s.surface_id \
          LEFT JOIN ({runs}) f ON f.surface_id = s.flat_reference AND f.band = l.band"
     );
     let with_repositioning = |u: &str| format!("sqrt({u} * {u} + repositioning_u_db * repositioning_u_db)");
@@ -41,7 +42,8 @@ pub(super) fn view_sql() -> String {
          CASE WHEN level_db IS NOT NULL THEN coalesce(unbiased_against_flat_db, against_flat_db) END \
          AS shown_against_flat_db, \
          CASE WHEN level_db IS NULL OR unbiased_against_flat_db IS NULL THEN {measured_u} ELSE {against_u} END \
-         AS shown_u_db, level_db IS NOT NULL AND unbiased_against_flat_db IS NULL AS has_foam, measurements, p5_db, p50_db, p95_db, min_db, max_db, spread_db, \
+         AS shown_u_db, level_db IS NOT NULL AND unbiased_against_flat_db IS NULL AS has_foam, \
+         measurements, p5_db, p50_db, p95_db, min_db, max_db, spread_db, \
          origin FROM ({parts})",
         combined = with_repositioning("u_db"),
         unbiased_u = known("unbiased_u_db"),
@@ -74,8 +76,8 @@ pub(super) fn column_notes() -> HashMap<String, HashMap<String, String>> {
         column_note(
             "unbiased_u_db",
             "dB",
-            "Its standard uncertainty: subtraction, noise, air, the estimate of Foam's reflection, and repositioning if \
-             it is known",
+            "Its standard uncertainty: subtraction, noise, air, the estimate of Foam's reflection, and repositioning \
+             if it is known",
         ),
         column_note("unbiased_against_flat_db", RE_FLAT_BAND, "unbiased_db less that of Flat"),
         column_note("unbiased_against_flat_u_db", "dB", "Its standard uncertainty, of the surface's parts and Flat's"),

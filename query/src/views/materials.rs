@@ -46,7 +46,8 @@ pub(super) fn view_sql(rig: &Rig) -> String {
         "SELECT surface_id, band, max(band_hz) AS band_hz, count(*) AS runs, \
          CAST(sum(measurements) AS BIGINT) AS measurements, avg(energy_over_flat) AS energy_over_flat, \
          sqrt(avg(power(p90_mean_u_db * {NATURAL_DB}, 2)) + coalesce(var_samp(energy_over_flat) / count(*) / \
-         power(avg(energy_over_flat), 2), 0)) AS energy_relative_u, {}, {} FROM surface_stats GROUP BY surface_id, band",
+         power(avg(energy_over_flat), 2), 0)) AS energy_relative_u, {}, {} \
+         FROM surface_stats GROUP BY surface_id, band",
         with_repeats("scattering", "scattering_u"),
         with_repeats("specular_loss", "specular_loss_u")
     );
@@ -78,7 +79,8 @@ pub(super) fn view_sql(rig: &Rig) -> String {
     );
     let found = format!(
         "SELECT s.surface_id, s.run_id, s.origin, s.surface_id = s.flat_reference AS is_flat, \
-         s.surface_id = s.foam_reference AS is_foam, t.band, t.band_hz, t.runs, t.measurements, t.energy_over_flat, h.boards, \
+         s.surface_id = s.foam_reference AS is_foam, t.band, t.band_hz, t.runs, t.measurements, \
+         t.energy_over_flat, h.boards, \
          s.material = flat.material AS is_of_flats_material, {octave_gap} AS octave_gap, \
          {is_level} AS is_level, 1 - h.reflection * ({energy}) / h.energy AS absorption, \
          sqrt(power(h.reflection * ({energy}) / h.energy, 2) * (power(h.energy_u / h.energy, 2) + \
@@ -158,20 +160,21 @@ pub(super) fn column_notes() -> HashMap<String, HashMap<String, String>> {
         column_note(
             "full_scale_hz",
             "Hz",
-            "Centre of the octave at full scale: that of the band over the rig's scale; null if the rig does not say it",
+            "Centre of the octave at full scale: that of the band over the rig's scale; null if the rig does not say \
+             it",
         ),
         column_note(
             "absorption",
             "1",
-            "1 less the reflected energy over an ideal reflector's, in the octave of IEC 61260-1, by hard surfaces over \
-             the same Flat; of the model's material and at the grid's angles; Flat's for a relief of its material; null \
-             if absorption_reason says why",
+            "1 less the reflected energy over an ideal reflector's, in the octave of IEC 61260-1, by hard surfaces \
+             over the same Flat; of the model's material and at the grid's angles; Flat's for a relief of its \
+             material; null if absorption_reason says why",
         ),
         column_note(
             "absorption_u",
             "1",
-            "Its standard uncertainty: noise, subtraction and air of both surfaces; of a relief, that it absorbs by its \
-             own area",
+            "Its standard uncertainty: noise, subtraction and air of both surfaces; of a relief, that it absorbs by \
+             its own area",
         ),
         column_note("runs", "1", "Runs that the measured coefficients are means over"),
         column_note("measurements", "1", "Pairs of these runs"),

@@ -131,15 +131,16 @@ impl LakeView {
             Self::Levels => "One row per surface and band: level and uncertainty over all of its runs.",
             Self::RoomParameters => "One row per measurement and octave: reverberation times, clarity, centre time.",
             Self::Materials => {
-                "One row per surface and octave, mean over its runs: absorption and scattering for simulations of rooms \
-                 at full scale, with standard uncertainties, and reasons for what is missing."
+                "One row per surface and octave, mean over its runs: absorption and scattering for simulations of \
+                 rooms at full scale, with standard uncertainties, and reasons for what is missing."
             }
             Self::Repeatability => {
                 "One row per surface, band and kind of level: repeatability and reproducibility over its runs, days \
                  and rigs (ISO 5725-2)."
             }
             Self::FlatDrift => {
-                "One row per run of a Flat and band: a control chart, with alarms where the rig drifted or a run differs."
+                "One row per run of a Flat and band: a control chart, with alarms where the rig drifted or a run \
+                 differs."
             }
         }
     }

@@ -151,8 +151,8 @@ pub struct SweepRecording {
     pub humidity_pct: ::core::option::Option<f64>,
     #[prost(double, optional, tag = "10")]
     pub pressure_hpa: ::core::option::Option<f64>,
-    /// Rate of the clock that plays the loopback over the microphone's, less 1, in parts per million, where they are two:
-    /// the microphone's signal is stretched by it before it is divided by the loopback. Its bytes are as recorded.
+    /// Rate of the clock that plays the loopback over the microphone's, less 1, in parts per million, if they are two: the
+    /// microphone's signal is stretched by it before it is divided by the loopback. Its bytes are as recorded.
     #[prost(double, optional, tag = "11")]
     pub playing_clock_ppm: ::core::option::Option<f64>,
 }

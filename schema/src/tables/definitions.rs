@@ -399,8 +399,8 @@ pub(super) fn surface_stats() -> Vec<Column> {
         Column::double(
             "energy_over_flat",
             "1",
-            "Reflected energy over Flat's in the octave around the band (IEC 61260-1), sums over the pairs, without Foam's \
-             own reflection; null if the sweep begins or ends within the octave",
+            "Reflected energy over Flat's in the octave around the band (IEC 61260-1), sums over the pairs, without \
+             Foam's own reflection; null if the sweep begins or ends within the octave",
         )
         .or_null(),
         Column::double("energy_over_flat_u", "1", "Its standard uncertainty, the jackknife over ninths of the panel")
@@ -417,8 +417,8 @@ pub(super) fn surface_stats() -> Vec<Column> {
         Column::double(
             "specular_loss",
             "1",
-            "Share of Flat's energy in the octave that is not mirrored: the scattering of ISO 17497-1 of a surface that absorbs as \
-             Flat",
+            "Share of Flat's energy in the octave that is not mirrored: the scattering of ISO 17497-1 of a surface \
+             that absorbs as Flat",
         )
         .or_null(),
         Column::double("specular_loss_u", "1", "Its standard uncertainty, the jackknife over ninths of the panel")

@@ -32,7 +32,8 @@ pub(super) async fn write_drift(source: &FigureSource, args: &DriftArgs) -> anyh
     let rows: Vec<DriftRow> = source.query_rows(&query).await?;
     anyhow::ensure!(
         !rows.is_empty(),
-        "surface `{flat}` is no Flat that has levels; hint: echolake sql \"select distinct flat_reference from surfaces\""
+        "surface `{flat}` is no Flat that has levels; hint: echolake sql \"select distinct flat_reference from \
+         surfaces\""
     );
     let mut runs: Vec<(&str, &str)> = Vec::new();
     for row in &rows {

@@ -35,7 +35,7 @@ pub(super) enum LevelKind {
     Measured,
     /// The same without Foam's own reflection.
     Unbiased,
-    /// The same without Foam's own reflection where it is known, as pages show.
+    /// The same without Foam's own reflection if it is known, as pages show.
     Shown,
 }
 

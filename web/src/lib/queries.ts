@@ -37,13 +37,15 @@ export const diffusionQuery = (lake: Lake, ids: readonly string[]) =>
     .map(quoted)
     .join(', ')}))\n  group by surface_id, run_id, point\n)\ngroup by surface_id order by surface_id`
 
-/** Levels re Flat total, or less Flat's level in the same band; percentiles are re Flat total. */
+/** Levels re Flat total, or less Flat's level in the same band. */
 export function statisticsQuery(ids: readonly string[], over: LevelReference): string {
   const columns =
     over === 'flat-total'
       ? ['shown_db', 'level_db', 'unbiased_db']
       : ['shown_against_flat_db', 'against_flat_db', 'unbiased_against_flat_db']
-  return `select surface_id, band, ${columns.join(', ')}, shown_u_db, has_foam, runs, p5_db, p50_db, p95_db, min_db, max_db, spread_db\nfrom levels\nwhere surface_id in (${ids.map(quoted).join(', ')})\norder by surface_id, band_hz`
+  const overFlat = (name: string) => (over === 'flat-total' ? name : `${name} - level_db + against_flat_db as ${name}`)
+  const percentiles = ['p5_db', 'p50_db', 'p95_db', 'min_db', 'max_db'].map(overFlat)
+  return `select surface_id, band, ${columns.join(', ')}, shown_u_db, has_foam, runs, ${percentiles.join(', ')}, spread_db\nfrom levels\nwhere surface_id in (${ids.map(quoted).join(', ')})\norder by surface_id, band_hz`
 }
 
 export const curvesQuery = (lake: Lake, id: string, pair?: number) =>

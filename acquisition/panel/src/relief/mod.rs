@@ -378,7 +378,7 @@ impl PanelRelief {
                 .into_iter()
                 .collect(),
             Self::Ridges(ridges) => {
-                ridges.parameters().into_iter().map(|(key, value)| (key.to_owned(), value)).collect()
+                ridges.named_parameters().into_iter().map(|(key, value)| (key.to_owned(), value)).collect()
             }
             Self::Layered(wall) => wall.parameters(),
         }

@@ -1,4 +1,4 @@
-//! Ridges along y that repeat along x: the sines and rectangular profiles that scattering is known of elsewhere.
+//! Ridges along y that repeat along x: sines and rectangular profiles, whose scattering is published.
 
 use super::parameter::{ParameterLayer, ParameterValue, ReliefParameter};
 
@@ -46,7 +46,7 @@ impl RidgeRelief {
     }
 
     /// Its parameters by name.
-    pub(super) fn parameters(&self) -> [(&'static str, serde_json::Value); 4] {
+    pub(super) fn named_parameters(&self) -> [(&'static str, serde_json::Value); 4] {
         [
             ("profile", self.profile.as_str().into()),
             ("period_mm", self.period_mm.into()),

@@ -35,8 +35,8 @@ struct MaterialBand {
     far_field_reason: Option<String>,
 }
 
-const MATERIALS: &str = "select full_scale_hz, band_hz, absorption, absorption_u, absorption_reason, scattering, scattering_u, \
-    scattering_reason, specular_loss, specular_loss_u, cast(far_scattering as double) as far_scattering, \
+const MATERIALS: &str = "select full_scale_hz, band_hz, absorption, absorption_u, absorption_reason, scattering, \
+    scattering_u, scattering_reason, specular_loss, specular_loss_u, cast(far_scattering as double) as far_scattering, \
     cast(far_scattering_u as double) as far_scattering_u, \
     cast(diffusion_normalised as double) as diffusion_normalised, \
     cast(diffusion_normalised_u as double) as diffusion_normalised_u, far_field_reason \
