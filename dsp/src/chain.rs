@@ -13,7 +13,7 @@ use crate::foam::subtract_foam;
 use crate::response_deconvolution::{ResponseDeconvolution, ResponseScratch};
 use crate::rise::{CurveShape, curve_shape};
 use crate::temperature::{ReferenceAir, TemperatureCorrection, response_limits_hz};
-use crate::uncertainty::EnergySensitivity;
+use crate::uncertainty::{EnergyChanges, EnergySensitivity};
 use crate::{Error, RealSample};
 
 /// Coldest and warmest air that a plan is made for, C: the range of all temperatures that are accepted.
@@ -340,7 +340,7 @@ impl<T: RealSample> DerivationPlan<T> {
         self.bank.spectrum_energy(spectrum)
     }
 
-    /// Computes what errors of the direct sound, and warmer air by its relative change of each bin, do to the energies
+    /// Computes what errors of the direct sound, and the air by its changes of each bin, do to the energies
     /// of a reflected response: `sensitivities[band]`.
     ///
     /// reflected, direct  `[ir_len / 2 + 1]`: their spectra
@@ -351,11 +351,11 @@ impl<T: RealSample> DerivationPlan<T> {
         &self,
         reflected: &[Complex<T>],
         direct: &[Complex<T>],
-        per_kelvin: impl Fn(usize) -> f64,
+        by_air: impl Fn(usize) -> EnergyChanges,
         sensitivities: &mut [EnergySensitivity],
         scratch: &mut DerivationScratch<T>,
     ) -> Result<(), Error> {
-        self.bank.compute_sensitivities(reflected, direct, per_kelvin, sensitivities, &mut scratch.bank)
+        self.bank.compute_sensitivities(reflected, direct, by_air, sensitivities, &mut scratch.bank)
     }
 
     fn measure_flat(&self, flat: &[T], scratch: &mut DerivationScratch<T>) -> Result<(), Error> {

@@ -6,7 +6,7 @@
 use std::ops::Range;
 
 use echolake_dsp::air::AirState;
-use echolake_dsp::air_correction::{AirScratch, SLOPE_UNCERTAINTY, TransformedResponse};
+use echolake_dsp::air_correction::{AirScratch, TransformedResponse};
 use echolake_dsp::chain::{DerivationPlan, DerivationScratch, DerivedResponse};
 use echolake_dsp::full_scale_octave::bin_shares_of_octaves;
 use echolake_dsp::mean::SignalMean;
@@ -149,9 +149,9 @@ impl<'a> RunDerivation<'a> {
         self.columns.push(number, derived);
         self.counted.push(is_counted);
         if self.references.flat_residual.is_some() {
-            let per_kelvin = |bin| correction.energy_per_kelvin(bin, pair.paths.reflected_m);
+            let by_air = |bin| correction.energy_changes(bin, pair.paths.reflected_m);
             let direct = &pair.direct.spectrum;
-            self.plan.compute_sensitivities(&reflected.spectrum, direct, per_kelvin, sensitivities, scratch)?;
+            self.plan.compute_sensitivities(&reflected.spectrum, direct, by_air, sensitivities, scratch)?;
             self.columns.push_sensitivities(sensitivities);
             if is_counted {
                 self.residual.add_pair(&reflected.spectrum, &pair.waveform)?;
@@ -204,13 +204,13 @@ impl<'a> RunDerivation<'a> {
         let response = &self.lake.rig().impulse_response;
         let pairs = self.counted.iter().filter(|is_counted| **is_counted).count() as f64;
         // Where energies are not corrected for the air, its difference to Flat's is part of their uncertainty.
-        let [difference_k, correction] = match response.air {
-            AirTreatment::Complete => [0.0, 2.0 * SLOPE_UNCERTAINTY * self.ln_ratio_sum / pairs],
+        let [difference_k, ln_ratio] = match response.air {
+            AirTreatment::Complete => [0.0, self.ln_ratio_sum / pairs],
             AirTreatment::Paper => [self.warmer_sum_k / pairs, 0.0],
         };
         let flat = (!is_flat).then_some(flat);
         let temperature_k = response.temperature_u_k.hypot(difference_k);
-        Some(LevelUncertainty { run, flat, temperature_k, correction })
+        Some(LevelUncertainty { run, flat, temperature_k, ln_ratio })
     }
 }
 

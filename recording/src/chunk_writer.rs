@@ -30,7 +30,7 @@ impl ChunkLane {
     /// Returns the lane of a topic's messages.
     pub fn from_topic(topic: &str) -> Self {
         match topic {
-            topics::SWEEP | topics::SWEEP_AUDIO => Self::Sweeps,
+            topics::SWEEP | topics::SWEEP_REPEAT | topics::SWEEP_AUDIO => Self::Sweeps,
             topics::IR => Self::Responses,
             _ => Self::Light,
         }

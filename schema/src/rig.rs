@@ -79,6 +79,15 @@ pub struct Sweep {
     pub tail_secs: f64,
     /// Peak level, dB re full scale.
     pub level_dbfs: f64,
+    /// Takes of each pair, 1 or 2: the second one shows what changes between them (ISO 18233:2006, time variance).
+    #[serde(skip_serializing_if = "is_single")]
+    pub repeat: u8,
+}
+
+// serde calls it with a reference.
+#[expect(clippy::trivially_copy_pass_by_ref)]
+fn is_single(repeat: &u8) -> bool {
+    *repeat == 1
 }
 
 /// Course of a sweep's frequency.
@@ -293,6 +302,7 @@ impl Default for Sweep {
             fade_secs: 0.001,
             tail_secs: 0.01,
             level_dbfs: -3.0,
+            repeat: 1,
         }
     }
 }
@@ -507,6 +517,11 @@ impl Rig {
                 format!("is {}, expected -120 to 0", sweep.level_dbfs),
             ),
             (
+                matches!(sweep.repeat, 1 | 2),
+                "sweep.repeat",
+                format!("is {}, expected 1 or 2 takes of each pair", sweep.repeat),
+            ),
+            (
                 (1..=16_777_216).contains(&self.impulse_response.length),
                 "impulse_response.length",
                 format!("is {}, expected 1 to 16777216", self.impulse_response.length),
@@ -632,6 +647,7 @@ mod tests {
             "sweep.rate_hz = 48000",
             "sweep.rate_hz = -1",
             "sweep.low_hz = 50000",
+            "sweep.repeat = 3",
             "bands.centres_hz = [1000, 3000]",
             "bands.centres_hz = []",
             "impulse_response.length = 0",
@@ -664,6 +680,8 @@ mod tests {
 
             sweep.low_hz = 50000
                 rig `paper`: `sweep.low_hz` is 50000, expected above 0 and below sweep.high_hz = 40000
+            sweep.repeat = 3
+                rig `paper`: `sweep.repeat` is 3, expected 1 or 2 takes of each pair
             bands.centres_hz = [1000, 3000]
                 rig `paper`: `bands.centres_hz` is [1000.0, 3000.0], expected 1 to 12 whole numbers of Hz, each twice the one before
             bands.centres_hz = []

@@ -7,12 +7,20 @@ use serde::{Deserialize, Serialize};
 /// 0.19.
 ///
 /// Source: docs/devices.md, the table of the boundary-element method, with `steep_facets`. A test compares the table
-/// with this constant and the two below, and with what the manual and the pages print of them.
+/// with these constants, and with what the manual and the pages print of them.
 pub const TRUSTED_PHASE: f64 = 0.18;
-/// Error of a band's mean level up to [`TRUSTED_PHASE`], dB: root mean square over the reliefs and bands of that table.
-pub const TRUSTED_ERROR_DB: f64 = 0.12;
-/// The same over [`TRUSTED_PHASE`].
+/// Error of a band's mean level over [`TRUSTED_PHASE`], dB: root mean square over the reliefs and bands of that table.
 pub const UNTRUSTED_ERROR_DB: f64 = 0.58;
+/// Standard uncertainty of a simulated mean level, dB: a constant and a slope over the phase of details, rad, up to the
+/// greatest. All bands of that table are within 1.96 times.
+const MEAN_LEVEL_U_DB: [f64; 3] = [0.04, 2.4, 0.65];
+
+/// Standard uncertainty of a relief's simulated mean level over the grid in a band, dB, by the phase of its details in
+/// that band, rad; the greatest if that is unknown.
+pub fn mean_level_u_db(detail_phase: Option<f64>) -> f64 {
+    let [constant, slope, greatest] = MEAN_LEVEL_U_DB;
+    detail_phase.map_or(greatest, |phase| (constant + slope * phase).min(greatest))
+}
 
 /// The `[simulation]` section of a rig file: effects that the simulated rig has in common with a real one. All are on
 /// unless the file switches them off. They are no part of what a lake's numbers mean, so runs with and without them go

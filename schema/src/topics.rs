@@ -12,6 +12,8 @@ pub const MICROPHONE_POSE: &str = "/microphone/pose";
 pub const SPEAKER_POSE: &str = "/speaker/pose";
 /// Each recorded sweep, both channels.
 pub const SWEEP: &str = "/sweep";
+/// The second recording of each sweep, both channels, if the rig plays it twice.
+pub const SWEEP_REPEAT: &str = "/sweep/repeat";
 /// Each recorded sweep's microphone channel, ten times slower, for ears and players.
 pub const SWEEP_AUDIO: &str = "/sweep/audio";
 /// Each impulse response.

@@ -182,7 +182,7 @@ fn print_reports(reports: &[PanelReport], panels: &[report::FoundPanel], target:
             };
             super::print_line(&format!("  levels {deviation:.2} dB rms from the target; {trusted}"))?;
         }
-        super::print_line("   target     found  deviation  figure, and error of the simulation")?;
+        super::print_line("   target     found  deviation  figure, and standard uncertainty of the simulation")?;
         for goal in &report.goals {
             let error = match goal.simulation_error_db {
                 Some(error) if goal.is_trusted => format!("means {error:.2} dB"),

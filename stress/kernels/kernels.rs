@@ -16,7 +16,7 @@ use echolake_dsp::rounding::{CURVE_BITS, round_samples};
 use echolake_dsp::sweep::{SineSweep, SweepShape};
 use echolake_dsp::air::AirState;
 use echolake_dsp::temperature::{ReferenceAir, TemperatureCorrection};
-use echolake_dsp::uncertainty::{EnergySensitivity, ResidualFit};
+use echolake_dsp::uncertainty::{EnergyChanges, EnergySensitivity, ResidualFit};
 use echolake_schema::Rig;
 use echolake_dsp::{Error, RealSample as _};
 use echolake_schema::messages::SampleFormat;
@@ -230,7 +230,7 @@ fn derivation(criterion: &mut Criterion) {
     group.bench_function(BenchmarkId::new("sensitivities", IR_LEN), |bencher| {
         let TransformedResponse { spectrum, .. } = &transformed;
         bencher.iter(|| {
-            plan.compute_sensitivities(black_box(spectrum), spectrum, |_| 0.01, &mut sensitivities, &mut scratch)
+            plan.compute_sensitivities(black_box(spectrum), spectrum, |_| EnergyChanges::default(), &mut sensitivities, &mut scratch)
         });
     });
     let mut residual = ResidualFit::<f32>::new(IR_LEN, RATE_HZ, [LOW_HZ, HIGH_HZ]).expect("settings of the paper");

@@ -85,6 +85,13 @@ VAPOUR = (1.2811805e-5, -1.9509874e-2, 34.04926034, -6.3536311e3)
 ENHANCEMENT = (1.00062, 3.14e-8, 5.6e-7)
 CARBON_DIOXIDE = 0.0004
 SIXTH_OCTAVE = 2 ** (1 / 6)
+# Slopes of speaker and microphone: distance of the bins that one is between, Hz; the part of the direct sound before
+# the reflection, and where it takes over: a frequency, and periods in the time between both arrivals.
+SLOPE_HZ = 250.0
+LEAST_PAIRS = 24
+LEAST_SEPARATION_SECS = 0.2e-3
+GATE_SECS = (0.15e-3, 0.05e-3)
+GATED_HZ, GATED_PERIODS = 12e3, 5.0
 # Share of the sweep's limits by which a tapered response's range is narrower.
 MARGIN = 0.015
 
@@ -256,27 +263,64 @@ class IndependentChain:
 
     def learn_slopes(self, foam: dict[int, Measured], flat: dict[int, Measured]) -> None:
         """d ln(spectrum) / d ln(frequency) of speaker and microphone: from the direct sound and from what Flat
-        reflects, each summed over the pairs as if it came at once, without absorption by the reference air."""
+        reflects, each summed over the pairs as if it came at once, without absorption by the reference air. At high
+        frequencies the direct slopes are those of its part before the reflection."""
         pairs = sorted(foam.keys() & flat.keys())
-        signals = [
-            np.array([foam[pair].response for pair in pairs]),
-            np.array([flat[pair].response - foam[pair].response for pair in pairs]),
-        ]
+        if len(pairs) < LEAST_PAIRS:
+            raise RuntimeError(f"{len(pairs)} pairs, expected {LEAST_PAIRS} or more")
         metres = np.array([flat[pair].metres for pair in pairs])
+        direct = np.array([foam[pair].response for pair in pairs])
+        reflected = np.array([flat[pair].response - foam[pair].response for pair in pairs])
+        emitted = [self.emitted(of, metres[:, path]) for path, of in enumerate((direct, reflected))]
+        self.slopes = np.array([self.exact_slopes(spectrum) for spectrum in emitted])
+        separation = (metres[:, 1] - metres[:, 0]) / self.reference.speed_of_sound()
+        apart = separation >= LEAST_SEPARATION_SECS
+        if apart.sum() < LEAST_PAIRS:
+            return
+        before_secs = metres[apart, 1, None] / self.reference.speed_of_sound() - GATE_SECS[0]
+        secs = np.arange(self.settings.length) / self.settings.rate_hz - before_secs
+        gate = (1 + np.cos(np.pi * np.clip(secs / (GATE_SECS[0] - GATE_SECS[1]), 0, 1))) / 2
+        gated = self.smooth_slopes(self.emitted(direct[apart] * gate, metres[apart, 0]))
+        from_hz = max(GATED_HZ, GATED_PERIODS / separation[apart].mean())
+        share = np.clip((self.hz / from_hz - 1) * 3, 0, 1)
+        self.slopes[0] = (1 - share) * self.slopes[0] + share * gated
+
+    def emitted(self, signals: Signal, metres: Signal) -> npt.NDArray[np.complex128]:
+        """Spectra summed as if all sound came at once, without absorption by the reference air."""
+        delays = metres[:, None] / self.reference.speed_of_sound()
+        aligned = np.fft.rfft(signals, axis=1) * np.exp(2j * np.pi * self.hz * delays) * metres[:, None]
+        absorbed = metres.mean() / 20 * self.reference.absorption(self.hz)
+        spectrum: npt.NDArray[np.complex128] = aligned.sum(axis=0) * 10**absorbed
+        return spectrum
+
+    def slope_range(self) -> tuple[int, int]:
+        """The first and the last bin with a slope of its own."""
         step_hz = self.settings.rate_hz / self.settings.length
         first = int(np.ceil(self.settings.low_hz * 1.02 / step_hz)) + 2
-        last = min(int(self.settings.high_hz * 0.98 / step_hz) - 2, len(self.hz) - 2)
-        for path, of_path in enumerate(signals):
-            delays = metres[:, path, None] / self.reference.speed_of_sound()
-            aligned = np.fft.rfft(of_path, axis=1) * np.exp(2j * np.pi * self.hz * delays) * metres[:, path, None]
-            emitted = aligned.sum(axis=0) * 10 ** (metres[:, path].mean() / 20 * self.reference.absorption(self.hz))
-            bins = np.arange(first, last + 1)
-            slopes = np.log(emitted[bins + 1] / emitted[bins - 1]) / np.log((bins + 1) / (bins - 1))
-            weights = np.abs(emitted[bins + 1] * emitted[bins - 1])
-            for index in range(len(self.hz)):
-                middle = min(max(index, first), last)
-                near = (bins >= round(middle / SIXTH_OCTAVE)) & (bins <= round(middle * SIXTH_OCTAVE))
-                self.slopes[path, index] = np.average(slopes[near], weights=weights[near])
+        return first, min(int(self.settings.high_hz * 0.98 / step_hz) - 2, len(self.hz) - 2)
+
+    def exact_slopes(self, spectrum: npt.NDArray[np.complex128]) -> npt.NDArray[np.complex128]:
+        """Slopes between bins that are 250 Hz to either side."""
+        first, last = self.slope_range()
+        bins = np.clip(np.arange(len(self.hz)), first, last)
+        distance = max(1, round(SLOPE_HZ * self.settings.length / self.settings.rate_hz))
+        distance = np.minimum(distance, np.minimum(bins - first, last - bins) + 1)
+        low, high = bins - distance, bins + distance
+        slopes: npt.NDArray[np.complex128] = np.log(spectrum[high] / spectrum[low]) / np.log(high / low)
+        return slopes
+
+    def smooth_slopes(self, spectrum: npt.NDArray[np.complex128]) -> npt.NDArray[np.complex128]:
+        """Slopes over a third of an octave."""
+        first, last = self.slope_range()
+        bins = np.arange(first, last + 1)
+        slopes = np.log(spectrum[bins + 1] / spectrum[bins - 1]) / np.log((bins + 1) / (bins - 1))
+        weights = np.abs(spectrum[bins + 1] * spectrum[bins - 1])
+        smooth = np.zeros(len(self.hz), complex)
+        for index in range(len(self.hz)):
+            middle = min(max(index, first), last)
+            near = (bins >= round(middle / SIXTH_OCTAVE)) & (bins <= round(middle * SIXTH_OCTAVE))
+            smooth[index] = np.average(slopes[near], weights=weights[near])
+        return smooth
 
     def reflected(self, of: Measured, foam: Measured) -> Signal:
         """What a surface reflects in the reference air: Foam's direct sound is brought to the surface's air first."""

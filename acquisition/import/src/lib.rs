@@ -10,6 +10,7 @@ mod positions;
 mod response;
 mod rew;
 mod sofa;
+mod take_repeats;
 mod take_summary;
 mod wav;
 mod wav_file;

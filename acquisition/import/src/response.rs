@@ -58,6 +58,7 @@ impl ImportedResponse {
                 loopback_level_dbfs: unknown,
                 arrival_error_us: unknown,
                 clock_ratio_ppm: None,
+                repeat_difference_db: None,
                 outside_level_db: unknown,
                 temperature_c: celsius,
                 humidity_pct: unknown,

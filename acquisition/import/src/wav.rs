@@ -6,7 +6,7 @@ mod tests;
 use std::ops::Range;
 use std::path::Path;
 
-use echolake_acquisition::run::assessment::TakeAssessor;
+use echolake_acquisition::run::assessment::{RepeatDifference, TakeAssessor};
 use echolake_acquisition::run::objection::TakeObjection;
 use echolake_acquisition::run::recorder::{LogLevel, Recorder, RunStart};
 use echolake_dsp::air::AirState;
@@ -22,6 +22,7 @@ use echolake_schema::{Grid, Rig, SampleRate, SurfaceId, Timestamp};
 
 use crate::batch::ImportBatch;
 use crate::response::{describe_unknown_air, known_celsius};
+use crate::take_repeats::TakeRepeats;
 use crate::take_summary::TakeSummary;
 use crate::wav_manifest::{self, ManifestRow, SurfaceFacts};
 use crate::{Error, ImportOptions, ImportedRun, wav_search};
@@ -96,8 +97,9 @@ impl WavImport<'_> {
         recorder.log(started, LogLevel::Info, NAME, &format!("{} recordings", rows.len()))?;
         let mut warnings = Vec::new();
         let mut summary = TakeSummary::new(self.rig.sweep.shape);
+        let mut repeats = TakeRepeats::new(rows.iter().map(|row| row.pair.id));
         for (at, row) in &timed {
-            warnings.extend(self.row(&mut recorder, row, *at, &mut summary)?);
+            warnings.extend(self.row(&mut recorder, row, *at, &mut summary, &mut repeats)?);
             done();
         }
         let count = rows.len() as u64;
@@ -150,6 +152,7 @@ impl WavImport<'_> {
         row: &ManifestRow,
         at: Timestamp,
         summary: &mut TakeSummary,
+        repeats: &mut TakeRepeats,
     ) -> Result<Option<String>, Error> {
         let unread = |column, what| Error::Row { path: self.manifest.to_owned(), line: row.line, column, what };
         let rig = self.rig;
@@ -196,12 +199,10 @@ impl WavImport<'_> {
             let joint = plan.joint_spectrum(&mut scratch);
             let again = assessor.assess_take(channels, joint, arrival, clipped).map_err(planned)?;
             assessment.arrival_error_us = again.arrival_error_us;
-            assessment.analysis.faults.extend(
-                again
-                    .analysis
-                    .recording_clock_ppm
-                    .map(|left| TakeFault::Clock { ppm: ppm + left, limit_ppm: ppm.abs() }),
-            );
+            assessment
+                .analysis
+                .faults
+                .extend(again.analysis.recording_clock_ppm.map(|left| TakeFault::UnevenClock { ppm, left_ppm: left }));
         }
         check_response(assessor.response(), samples.len(), arrival, rig).map_err(|e| unread("recording", e))?;
         // The geometry of a foreign rig is known less well than its files say, and the level outside was not recorded:
@@ -244,6 +245,9 @@ impl WavImport<'_> {
                 other => reasons.push(other.to_string()),
             }
         }
+        let repeat = repeats.compare_take(row.pair.id, &assessor);
+        let change = repeat.and_then(RepeatDifference::find_objection);
+        reasons.extend(change.map(|objection| format!("{objection}; hint: {}", objection.hint())));
         let faults = &assessment.analysis.faults;
         let distortion = faults.iter().filter(|fault| matches!(fault, TakeFault::Distortion { .. }));
         reasons.extend(distortion.map(|fault| format!("{fault}; hint: {}", fault.hint())));
@@ -304,6 +308,7 @@ impl WavImport<'_> {
                 loopback_level_dbfs: assessment.loopback_dbfs,
                 arrival_error_us: assessment.arrival_error_us,
                 clock_ratio_ppm: Some(assessment.analysis.clock_ratio_ppm).filter(|ppm| ppm.is_finite()),
+                repeat_difference_db: repeat.map(|found| found.difference_db).filter(|db| db.is_finite()),
                 outside_level_db: f64::NAN,
                 temperature_c: celsius,
                 humidity_pct: row.humidity_pct,

@@ -24,6 +24,12 @@ const ARRIVAL_WINDOW: f64 = 5.0;
 /// a reflection under the direct sound or, focused, not far over it.
 const ARRIVAL_SHARE: f32 = 0.3;
 
+/// Greatest energy of the difference between two takes' responses over that of the first, dB, beyond their noise: what
+/// is subtracted of Foam is known as well as that.
+const MAX_TIME_VARIANCE_DB: f64 = -40.0;
+/// Standard deviations of an estimated noise within which a difference is explained by it.
+const NOISE_DEVIATIONS: f64 = 3.0;
+
 /// Assessment of one recording.
 #[derive(Debug, Clone, PartialEq)]
 pub struct TakeAssessment {
@@ -41,6 +47,17 @@ pub struct TakeAssessment {
     pub analysis: TakeAnalysis,
 }
 
+/// Difference between the responses of two takes of one pair, which nothing should change (ISO 18233:2006).
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct RepeatDifference {
+    /// Energy of the difference over that of the first response, dB.
+    pub difference_db: f64,
+    /// The noise in it, likewise.
+    pub noise_db: f64,
+    /// What the noise does not explain, likewise; negative infinity if it explains all.
+    pub unexplained_db: f64,
+}
+
 /// Assesses recordings of one length.
 pub struct TakeAssessor {
     analyzer: TakeAnalyzer,
@@ -50,6 +67,8 @@ pub struct TakeAssessor {
     scratch: TakeScratch,
     signal_len: usize,
     rate_hz: f64,
+    /// Sweep's range over half the sampling rate: independent values of a sample.
+    bandwidth_share: f64,
 }
 
 impl TakeAssessor {
@@ -69,6 +88,7 @@ impl TakeAssessor {
             scratch: TakeScratch::default(),
             signal_len,
             rate_hz,
+            bandwidth_share: (rig.sweep.high_hz - rig.sweep.low_hz) / (rate_hz / 2.0),
         })
     }
 
@@ -98,6 +118,22 @@ impl TakeAssessor {
     /// Returns the whole response of the recording that was assessed last, as long as the recording.
     pub fn response(&self) -> &[f32] {
         &self.response
+    }
+
+    /// Compares the response that was assessed last, of a pair's second take, with that of the first.
+    ///
+    /// first `[recording_len]`: [`Self::response`] of the first take
+    pub fn compare_repeat(&self, first: &[f32]) -> RepeatDifference {
+        let difference: Vec<f32> = self.response.iter().zip(first).map(|(b, a)| b - a).collect();
+        let quiet = quiet_range(difference.len(), self.signal_len);
+        let values = self.bandwidth_share * quiet.len().min(self.signal_len).max(1) as f64;
+        let [signal, found] = [first, &difference].map(|x| mean_power(&x[..self.signal_len]));
+        // Without a quiet part the ratio of signal and noise is unknown, which is an objection of its own.
+        let noise = difference.get(quiet).map_or(f64::NAN, mean_power);
+        let explained = noise * (1.0 + NOISE_DEVIATIONS * (4.0 / values).sqrt());
+        let [difference_db, noise_db, unexplained_db] =
+            [found, noise, (found - explained).max(0.0)].map(|power| power_to_db(power / signal));
+        RepeatDifference { difference_db, noise_db, unexplained_db }
     }
 
     // The deconvolution spreads noise over the whole length; far behind the response there is nothing else.
@@ -133,6 +169,15 @@ impl TakeAssessor {
         let strong = searched.iter().position(|x| x.abs() >= ARRIVAL_SHARE * strongest).unwrap_or(0);
         let rises = |n: &usize| self.response[n + 1].abs() > self.response[*n].abs();
         (strong.max(1)..end - 1).find(|n| !rises(n)).unwrap_or(end - 1).max(1)
+    }
+}
+
+impl RepeatDifference {
+    /// Returns the reason against both takes, if they differ by more than their noise.
+    pub fn find_objection(self) -> Option<TakeObjection> {
+        let Self { difference_db, noise_db, unexplained_db } = self;
+        let most_db = MAX_TIME_VARIANCE_DB;
+        (unexplained_db > most_db).then_some(TakeObjection::TimeVariance { difference_db, noise_db, most_db })
     }
 }
 

@@ -104,6 +104,10 @@ pub struct RunController<'a> {
     scratch: ResponseScratch<f32>,
     assessor: TakeAssessor,
     take: AudioTake,
+    /// The second take of the pair, if the rig makes two.
+    repeat: AudioTake,
+    /// The whole response of the first one.
+    first_response: Vec<f32>,
     microphone: Vec<f32>,
     loopback: Vec<f32>,
     ir: Vec<f32>,
@@ -161,6 +165,8 @@ impl<'a> RunController<'a> {
             deconvolution,
             assessor: TakeAssessor::new(rig, recording_len).map_err(failed)?,
             take: AudioTake::default(),
+            repeat: AudioTake::default(),
+            first_response: Vec::new(),
             microphone: Vec::new(),
             loopback: Vec::new(),
         })

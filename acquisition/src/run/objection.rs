@@ -43,6 +43,19 @@ pub enum TakeObjection {
         /// The rig's limit.
         most_us: f64,
     },
+    /// Two takes of the pair differ by more than their noise.
+    #[error(
+        "two takes differ by {difference_db:.1} dB re the response, of which noise explains {noise_db:.1} dB, limit \
+         {most_db:.1} dB"
+    )]
+    TimeVariance {
+        /// Energy of the difference of both responses over that of the first, dB.
+        difference_db: f64,
+        /// The noise in it, likewise.
+        noise_db: f64,
+        /// The limit for what noise does not explain, dB.
+        most_db: f64,
+    },
     /// It is loud outside.
     #[error("outside noise {level_db:.1} dB, limit {most_db:.1} dB")]
     Outside {
@@ -94,6 +107,9 @@ impl TakeObjection {
             Self::Broken { .. } => "is the loopback cable in, from the output to the second input?",
             Self::Noise { .. } => "are amplifier and microphone on, and the drives off?",
             Self::Arrival { .. } => "do microphone and speaker stand where the arms say, and is the temperature right?",
+            Self::TimeVariance { .. } => {
+                "what changes between two takes: an automatic gain, moving air, a clock, something that is loose?"
+            }
             Self::Outside { .. } => "wait until it is quiet, or raise `validation.outside_level_db` in the rig file",
             Self::Unknown { what: SIGNAL_TO_NOISE | ARRIVAL } => {
                 "are recording and response long enough? See `sweep` and `impulse_response.length` in the rig file"

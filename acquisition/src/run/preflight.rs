@@ -49,7 +49,7 @@ impl std::fmt::Display for PreflightFinding {
 pub fn expected_bytes(rig: &Rig, keep: RecordingMode, pairs: usize) -> u64 {
     let response = response_len(rig) as f64 * RESPONSE_BYTES_A_SAMPLE;
     let sweep = match keep {
-        RecordingMode::Sweeps => rig.recording_len() as f64 * SWEEP_BYTES_A_SAMPLE,
+        RecordingMode::Sweeps => rig.recording_len() as f64 * SWEEP_BYTES_A_SAMPLE * f64::from(rig.sweep.repeat),
         RecordingMode::ResponsesOnly => 0.0,
     };
     (RUN_BYTES + (sweep + response + PAIR_BYTES) * REPEATS * pairs as f64) as u64

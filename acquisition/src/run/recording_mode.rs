@@ -14,11 +14,11 @@ pub enum RecordingMode {
 }
 
 impl RecordingMode {
-    /// Returns the bytes that one attempt takes at most: two channels of three bytes and audio of two per sample of the
-    /// sweep, the response, and messages of fixed size.
+    /// Returns the bytes that one attempt takes at most: two channels of three bytes per sample of each
+    /// take, audio of two, the response, and messages of fixed size.
     pub(crate) fn attempt_bytes(self, rig: &Rig) -> u64 {
         const MESSAGES: usize = 8192;
-        let sweep = if self == Self::Sweeps { rig.recording_len() * 8 } else { 0 };
+        let sweep = if self == Self::Sweeps { rig.recording_len() * (2 + 6 * rig.sweep.repeat as usize) } else { 0 };
         (sweep + response_len(rig) * 4 + MESSAGES) as u64
     }
 }

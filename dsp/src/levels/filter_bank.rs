@@ -10,7 +10,7 @@ use rustfft::{Fft, FftDirection};
 
 use crate::energy::accumulate_couple;
 use crate::error::check_len;
-use crate::uncertainty::{EnergySensitivity, bin_angle};
+use crate::uncertainty::{EnergyChanges, EnergySensitivity, bin_angle};
 use crate::{Error, RealSample};
 
 /// The itersine window on |x| <= 1/2: sin(pi/2 cos^2(pi x)), 0 elsewhere.
@@ -68,7 +68,7 @@ struct BandWeights {
 }
 
 /// Values of one bin that are summed to an [`EnergySensitivity`], in the order of its fields.
-type SensitivityTerms = [f64; 6];
+type SensitivityTerms = [f64; 7];
 
 /// Bins that are summed side by side.
 const LANES: usize = 8;
@@ -255,7 +255,7 @@ impl<T: RealSample> FilterBankPlan<T> {
     }
 
     /// Energy of a reflected response in each band, and what errors of the direct sound beneath it do to that energy,
-    /// and warmer air by its relative change in each bin.
+    /// and the air by its changes of each bin.
     ///
     /// reflected, direct  `[len / 2 + 1]`: their spectra
     ///
@@ -265,7 +265,7 @@ impl<T: RealSample> FilterBankPlan<T> {
         &self,
         reflected: &[Complex<T>],
         direct: &[Complex<T>],
-        per_kelvin: impl Fn(usize) -> f64,
+        by_air: impl Fn(usize) -> EnergyChanges,
         sensitivities: &mut [EnergySensitivity],
         scratch: &mut FilterBankScratch<T>,
     ) -> Result<(), Error> {
@@ -280,15 +280,18 @@ impl<T: RealSample> FilterBankPlan<T> {
             let gain = product.re.f64();
             // A delay adds minus the first derivative, and half of its square times the second.
             let delay = angle * product.im.f64();
-            *terms = [energy, 2.0 * gain, power, 2.0 * delay, angle * angle * (power - gain), energy * per_kelvin(bin)];
+            let air = by_air(bin);
+            let [warmer, ratio] = [air.per_kelvin, air.uncertainty_per_ratio].map(|change| energy * change);
+            *terms = [energy, 2.0 * gain, power, 2.0 * delay, angle * angle * (power - gain), warmer, ratio];
         }
         for (band, sensitivity) in self.bands.iter().zip(sensitivities) {
             let mut sums = SensitivityTerms::default();
             for (terms, weight) in scratch.terms[band.bins.clone()].iter().zip(&band.weights) {
                 sums.iter_mut().zip(terms).for_each(|(sum, term)| *sum += weight * term);
             }
-            let [energy, gain, gain_square, delay, delay_square, temperature] = sums;
-            *sensitivity = EnergySensitivity { energy, gain, gain_square, delay, delay_square, temperature };
+            let [energy, gain, gain_square, delay, delay_square, temperature, correction] = sums;
+            *sensitivity =
+                EnergySensitivity { energy, gain, gain_square, delay, delay_square, temperature, correction };
         }
         Ok(())
     }

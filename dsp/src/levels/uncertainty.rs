@@ -115,6 +115,18 @@ pub struct EnergySensitivity {
     pub delay_square: f64,
     /// Change of the energy per kelvin that the air is warmer.
     pub temperature: f64,
+    /// Standard uncertainty of the energy by its correction to the reference air, per logarithm of the ratio of speeds
+    /// of sound.
+    pub correction: f64,
+}
+
+/// What the correction for the air leaves uncertain of the energy of a bin.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct EnergyChanges {
+    /// Relative change per kelvin that the air is warmer.
+    pub per_kelvin: f64,
+    /// Relative standard uncertainty per logarithm of the ratio of speeds of sound.
+    pub uncertainty_per_ratio: f64,
 }
 
 /// Error of a level relative to its energy, by what its measurements share.
@@ -128,6 +140,8 @@ pub struct LevelError {
     pub own_per_kelvin: f64,
     /// The same of Flat's air.
     pub flat_per_kelvin: f64,
+    /// Per logarithm of the ratio of speeds of sound that the run is corrected for; the whole run has the same.
+    pub per_ratio: f64,
 }
 
 /// The residuals of a run and of Flat's, whose energies are divided by one another.
@@ -139,8 +153,9 @@ pub struct LevelUncertainty {
     pub flat: Option<DirectSoundResidual>,
     /// Standard uncertainty of the temperature of a run's air, K.
     pub temperature_k: f64,
-    /// Standard uncertainty of the run's energies by their correction to the reference air, relative to them.
-    pub correction: f64,
+    /// Mean logarithm of the speed of sound in the run's air over that in the reference air; 0 if energies are not
+    /// corrected for it.
+    pub ln_ratio: f64,
 }
 
 impl<T: RealSample> ResidualFit<T> {
@@ -317,6 +332,7 @@ impl EnergySensitivity {
             delay: a.delay + b.delay,
             delay_square: a.delay_square + b.delay_square,
             temperature: a.temperature + b.temperature,
+            correction: a.correction + b.correction,
         })
     }
 }
@@ -336,6 +352,7 @@ impl LevelUncertainty {
         let mut error = LevelError {
             variance: 4.0 * self.run.noise / of.energy,
             own_per_kelvin: of.temperature / of.energy,
+            per_ratio: of.correction / of.energy,
             ..LevelError::default()
         };
         if let Some(residual) = &self.flat {
@@ -367,7 +384,8 @@ impl LevelUncertainty {
     /// Combines the parts of an error to a standard uncertainty, dB.
     pub fn combine_db(&self, error: &LevelError) -> f64 {
         let temperature = error.own_per_kelvin.hypot(error.flat_per_kelvin) * self.temperature_k;
-        let squares = error.common.powi(2) + error.variance + temperature.powi(2) + self.correction.powi(2);
+        let correction = error.per_ratio * self.ln_ratio;
+        let squares = error.common.powi(2) + error.variance + temperature.powi(2) + correction.powi(2);
         10.0 / LN_10 * squares.sqrt()
     }
 }
@@ -416,12 +434,14 @@ mod tests {
         let mut scratch = plan.make_scratch();
         let mut sensitivities = |signal: &[f64]| {
             let mut found = [EnergySensitivity::default(); 5];
-            plan.compute_sensitivities(&spectrum(signal), &spectrum(&direct), |_| 0.01, &mut found, &mut scratch)
+            let by_air = |_| EnergyChanges { per_kelvin: 0.01, uncertainty_per_ratio: 0.8 };
+            plan.compute_sensitivities(&spectrum(signal), &spectrum(&direct), by_air, &mut found, &mut scratch)
                 .expect("sensitivities");
             found
         };
         let before = sensitivities(&reflected);
         assert!(before.iter().all(|band| (band.temperature / band.energy - 0.01).abs() < 1e-12), "{before:?}");
+        assert!(before.iter().all(|band| (band.correction / band.energy - 0.8).abs() < 1e-12), "{before:?}");
         for (gain, delay) in [(0.02, 0.0), (0.0, 0.03)] {
             // The direct sound of the run, later and louder than what is subtracted.
             let left = sum(&sum(&pulse(80.0 + delay), gain, &direct), -1.0, &direct);
@@ -496,13 +516,16 @@ mod tests {
             delay: 0.2,
             delay_square: 1.0,
             temperature: 0.001,
+            correction: 0.4,
         };
-        let mut levels = LevelUncertainty { run: residual, flat: Some(residual), temperature_k: 0.1, correction: 0.0 };
+        let mut levels = LevelUncertainty { run: residual, flat: Some(residual), temperature_k: 0.1, ln_ratio: 0.0 };
         let error = levels.relative_error(&flat, &flat);
         assert!(error.common.abs() < 1e-15 && error.own_per_kelvin == 0.002, "{error:?}");
         let db = levels.level_db(&flat, &flat).expect("a level");
         assert!((0.01..0.1).contains(&db), "{db}");
         assert_eq!(levels.level_db(&EnergySensitivity::default(), &flat), None);
+        levels.ln_ratio = 0.01;
+        assert!((levels.level_db(&flat, &flat).expect("a level").powi(2) - db * db - 0.0347f64.powi(2)).abs() < 1e-5);
         levels.flat = None;
         // Half of the variance: nothing is divided by.
         assert!((levels.relative_error(&flat, &flat).common - 0.0064).abs() < 1e-12);

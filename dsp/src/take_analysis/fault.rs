@@ -102,6 +102,16 @@ pub enum TakeFault {
         /// The limit.
         limit_ppm: f64,
     },
+    /// The recording's clock is another than the loopback's, and its ratio changes during the sweep.
+    #[error(
+        "recording's clock drifts unevenly: {ppm:+.1} ppm against the loopback's are undone, {left_ppm:+.1} are left"
+    )]
+    UnevenClock {
+        /// Rate of the playing clock over the recording one, less 1, ppm.
+        ppm: f64,
+        /// The same once the recording is stretched by it.
+        left_ppm: f64,
+    },
     /// The signal exceeds full scale between its samples.
     #[error("{channel} reaches {peak_dbfs:+.2} dBFS between samples")]
     BetweenSamples {
@@ -137,7 +147,7 @@ impl TakeFault {
             Self::CutStart { .. } | Self::CutEnd { .. } => "begin the recording before the sweep, and end it later",
             Self::NoResponse { .. } => "is the microphone on, and are both files of one take and one sampling rate?",
             Self::Dropout { .. } => "use a larger buffer of the audio interface, and record again",
-            Self::Clock { .. } => "record the loopback by the microphone's interface",
+            Self::Clock { .. } | Self::UnevenClock { .. } => "record the loopback by the microphone's interface",
             Self::BetweenSamples { .. } => "lower the gain by as much",
             Self::Distortion { .. } => "lower the level, or play an exponential sweep, which shows harmonics by order",
         }

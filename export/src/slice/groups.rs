@@ -211,7 +211,7 @@ pub(super) fn is_once(topic: &str) -> bool {
 
 // The topics whose messages begin with pair and attempt.
 fn names_pair(topic: &str) -> bool {
-    matches!(topic, topics::SWEEP | topics::IR | topics::MEASUREMENT)
+    matches!(topic, topics::SWEEP | topics::SWEEP_REPEAT | topics::IR | topics::MEASUREMENT)
 }
 
 /// The fields with which these messages begin.

@@ -121,7 +121,7 @@ impl SliceWriter {
         }
         // What is played is a copy of what was recorded, and next to it nearly free (a quarter of a run's size).
         let topic = match message.channel.topic.as_str() {
-            topics::SWEEP_AUDIO => topics::SWEEP,
+            topics::SWEEP_AUDIO | topics::SWEEP_REPEAT => topics::SWEEP,
             other => other,
         };
         if let Some(lane) = self.lane_of.get(topic) {

@@ -45,6 +45,7 @@ fn measurement_batch(rig: &Rig, grid: &Grid, keys: &RunKeys, rows: &[(Measuremen
         .push_ints("clipped_samples", rows.iter().map(|(m, _)| m.clipped_samples as i32))
         .push_floats("arrival_error_us", rows.iter().map(|(m, _)| known(m.arrival_error_us)))
         .push_floats("clock_ratio_ppm", rows.iter().map(|(m, _)| m.clock_ratio_ppm.and_then(known)))
+        .push_floats("repeat_difference_db", rows.iter().map(|(m, _)| m.repeat_difference_db.and_then(known)))
         .push_floats("microphone_residual_mm", rows.iter().map(|(m, _)| known(m.microphone_residual_mm)))
         .push_floats("speaker_residual_mm", rows.iter().map(|(m, _)| known(m.speaker_residual_mm)))
         .push_texts("source", rows.iter().map(|(_, r)| r.source.label()))

@@ -133,6 +133,7 @@ fn p90_mean_uncertainty(values: &[f64], errors: &[LevelError], uncertainty: &Lev
         mean.variance += share * share * error.variance;
         mean.own_per_kelvin += share * error.own_per_kelvin;
         mean.flat_per_kelvin += share * error.flat_per_kelvin;
+        mean.per_ratio += share * error.per_ratio;
     }
     (sum > 0.0).then(|| uncertainty.combine_db(&mean)).and_then(finite_value)
 }
@@ -155,7 +156,7 @@ mod tests {
     #[test]
     fn common_errors_stay_in_the_mean_and_others_average_out() {
         let run = DirectSoundResidual::default();
-        let mut uncertainty = LevelUncertainty { run, flat: None, temperature_k: 0.1, correction: 0.0 };
+        let mut uncertainty = LevelUncertainty { run, flat: None, temperature_k: 0.1, ln_ratio: 0.0 };
         let of = |error: LevelError, uncertainty: &LevelUncertainty| {
             p90_mean_uncertainty(&[0.5; 100], &[error; 100], uncertainty).expect("an uncertainty")
         };
@@ -165,8 +166,8 @@ mod tests {
         let slopes = LevelError { own_per_kelvin: 0.03, flat_per_kelvin: 0.04, ..LevelError::default() };
         assert!((u(slopes) - 0.0217).abs() < 1e-4);
         assert_eq!(p90_mean_uncertainty(&[0.5; 100], &[], &uncertainty), None);
-        uncertainty.correction = 0.01;
-        assert!((of(LevelError::default(), &uncertainty) - 0.0434).abs() < 1e-4);
+        uncertainty.ln_ratio = 0.005;
+        assert!((of(LevelError { per_ratio: 2.0, ..LevelError::default() }, &uncertainty) - 0.0434).abs() < 1e-4);
     }
 
     #[test]

@@ -85,6 +85,10 @@ pub struct Measurement {
     /// Rate of the playing clock over that of the recording one, less 1, ppm; unset if the take does not show it.
     #[prost(double, optional, tag = "17")]
     pub clock_ratio_ppm: ::core::option::Option<f64>,
+    /// Energy of the difference between the responses of two takes over that of the first, noise included, dB; unset
+    /// without a second take.
+    #[prost(double, optional, tag = "18")]
+    pub repeat_difference_db: ::core::option::Option<f64>,
 }
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, ::prost::Enumeration)]
 #[repr(i32)]

@@ -217,6 +217,13 @@ pub(super) fn measurement_columns() -> Vec<Column> {
         Column::float("arrival_error_us", "us", "Direct sound's arrival minus the one geometry gives").or_null(),
         Column::float("clock_ratio_ppm", "ppm", "Rate of the playing clock over that of the recording one, less 1")
             .or_null(),
+        Column::float(
+            "repeat_difference_db",
+            "dB",
+            "Energy of the difference between the responses of two takes over that of the first, noise included; null \
+             without a second take",
+        )
+        .or_null(),
         Column::float("microphone_residual_mm", "mm", "Measured minus wanted position of the microphone").or_null(),
         Column::float("speaker_residual_mm", "mm", "Measured minus wanted position of the speaker").or_null(),
         Column::text(

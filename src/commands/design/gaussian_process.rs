@@ -139,6 +139,45 @@ mod tests {
         assert!((value - 3.0f64.sin() + 0.4).abs() < 0.05 && deviation < 0.06, "{value} {deviation}");
     }
 
+    // The table of docs/devices.md: joints of 0.6, 1.2 and 1.5 mm, mean levels by band, simulated and by boundary
+    // elements, which stand for a measurement.
+    const WIDTHS: [f64; 3] = [0.0, 0.67, 1.0];
+    const JOINTS_DB: [[[f64; 3]; 2]; 5] = [
+        [[0.0, 0.0, -0.01], [-0.01, 0.0, 0.0]],
+        [[0.0, -0.01, -0.01], [0.0, 0.01, 0.01]],
+        [[-0.01, -0.03, -0.04], [0.02, 0.03, 0.03]],
+        [[-0.01, -0.06, -0.08], [0.08, 0.14, 0.18]],
+        [[0.06, 0.13, 0.18], [0.25, 0.87, 1.21]],
+    ];
+
+    #[test]
+    fn boundary_elements_are_within_the_difference_of_simulations() {
+        let difference = echolake_schema::simulation::UNTRUSTED_ERROR_DB;
+        for (band, [simulated, exact]) in JOINTS_DB.iter().enumerate() {
+            let figure = |at: usize, value: f64, is_measured: bool| KnownFigure {
+                place: vec![WIDTHS[at]],
+                value,
+                uncertainty: 0.1,
+                is_measured,
+            };
+            for left_out in 0..3 {
+                let others = (0..3).filter(|at| *at != left_out);
+                let measured: Vec<_> = others.map(|at| figure(at, exact[at], true)).collect();
+                let all: Vec<_> =
+                    (0..3).map(|at| figure(at, simulated[at], false)).chain(measured.iter().cloned()).collect();
+                let error = |known: &[KnownFigure]| {
+                    let process = GaussianProcess::fit_figures(known, difference).expect("a fit");
+                    let (value, deviation) = process.predict_figure(&[WIDTHS[left_out]]);
+                    ((value - exact[left_out]).abs(), deviation)
+                };
+                let ((alone, _), (off, deviation)) = (error(&all[..3]), error(&all));
+                assert!(off <= 1.96 * deviation.hypot(0.1), "band {band}, {left_out}: {off} of {deviation}");
+                // Measurements beside it tell how wrong the simulation is.
+                assert!(off < alone + 0.1, "band {band}, {left_out}: {off} and {alone}");
+            }
+        }
+    }
+
     #[test]
     fn too_little_gives_no_process() {
         assert!(GaussianProcess::fit_figures(&[known(0.1, 0.1), known(0.5, 0.1)], 0.0).is_none());

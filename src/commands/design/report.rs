@@ -11,7 +11,7 @@ use echolake_figures::{FigureNotes, GridFigure, GridLayer, GridPanel, LevelPalet
 use echolake_panel::mesh::{BACK_MM, FACETS, Mesh, MeshFormat};
 use echolake_panel::relief::PanelRelief;
 use echolake_query::figure_rows::band_labels;
-use echolake_schema::simulation::{TRUSTED_ERROR_DB, TRUSTED_PHASE, UNTRUSTED_ERROR_DB};
+use echolake_schema::simulation::{TRUSTED_PHASE, mean_level_u_db};
 use echolake_schema::{Grid, Rig, SurfaceId};
 use serde::Serialize;
 use serde_json::json;
@@ -46,7 +46,7 @@ pub(super) struct GoalRow {
     pub target: f64,
     pub found: f64,
     pub deviation: f64,
-    /// Error of the simulation's mean levels, dB; None for other figures, whose error is not known.
+    /// Standard uncertainty of the panel's simulated mean level, dB; None for other figures, whose error is not known.
     pub simulation_error_db: Option<f64>,
     pub is_trusted: bool,
 }
@@ -74,7 +74,7 @@ impl FoundPanel {
     }
 
     fn mean_error_db(&self, band: usize) -> f64 {
-        if self.is_trusted(band) { TRUSTED_ERROR_DB } else { UNTRUSTED_ERROR_DB }
+        mean_level_u_db(self.detail_phases[band].filter(|_| self.has_steep_facets))
     }
 
     /// Returns what is said of it.

@@ -192,6 +192,38 @@ fn a_late_arrival_is_named_and_silence_is_no_response() {
     assert!(imported(0).expect("in time").0.iter().all(|warning| !warning.contains("arrives")));
 }
 
+// ISO 18233: what differs between two takes is no property of a surface.
+#[test]
+fn attempts_of_one_pair_are_compared() {
+    let [recording, mut sweep] = late_take(0);
+    sweep.resize(recording.len(), 0.0);
+    for (gain, is_said) in [(1.0, false), (0.996, false), (0.97, true)] {
+        let place = WavFolder::new(0.5);
+        let changed: Vec<f32> = recording.iter().map(|x| gain * x).collect();
+        for (name, samples) in [("take.wav", &recording), ("again.wav", &changed), ("loopback.wav", &sweep)] {
+            let bytes: Vec<u8> = samples.iter().flat_map(|x| x.to_le_bytes()).collect();
+            let file = encode_wav(SampleFormat::F32le, 96_000, &[&bytes]).expect("a file");
+            std::fs::write(place.0.path().join(name), file).expect("written");
+        }
+        let rows = "surface,recording,loopback,microphone,speaker,temperature_c,attempt\n\
+                    a,take.wav,loopback.wav,0/0/0,0/0/1,20,1\na,again.wav,loopback.wav,0/0/0,0/0/1,20,2\n";
+        std::fs::write(place.manifest(), rows).expect("written");
+        let runs = place.import(&mut |_, _| {}).expect("imported");
+        let said = runs[0].warnings.iter().any(|warning| warning.starts_with("line 3: two takes differ by -30.5 dB"));
+        assert_eq!(said, is_said, "{gain}: {:?}", runs[0].warnings);
+        let file = std::fs::read(&runs[0].path).expect("the run");
+        let messages = mcap::MessageStream::new(&file).expect("an MCAP file").map(|m| m.expect("whole"));
+        let verdicts = messages.filter(|m| m.channel.topic == echolake_schema::topics::MEASUREMENT);
+        let found: Vec<_> = verdicts
+            .map(|m| <Measurement as prost::Message>::decode(&m.data[..]).expect("decoded").repeat_difference_db)
+            .collect();
+        let expected_db = 20.0 * (1.0 - f64::from(gain)).log10();
+        assert_eq!(found[0], None);
+        let is_equal = found[1].map_or(gain == 1.0, |db| (db - expected_db).abs() < 0.1);
+        assert!(is_equal, "{gain}: {found:?}, expected {expected_db}");
+    }
+}
+
 #[test]
 fn a_sweeps_own_file_places_the_take_by_geometry() {
     let [recording, sweep] = late_take(30_000);

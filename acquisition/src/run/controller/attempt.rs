@@ -9,8 +9,8 @@ use echolake_schema::samples::split_24;
 use echolake_schema::{Celsius, Pair, Timestamp};
 
 use super::{Error, NAME, RunController, RunProgress};
-use crate::rig::{AmbientReading, ArmPositions, DrivePower, Error as RigError};
-use crate::run::assessment::TakeAssessment;
+use crate::rig::{AmbientReading, ArmPositions, AudioTake, DrivePower, Error as RigError};
+use crate::run::assessment::{RepeatDifference, TakeAssessment};
 use crate::run::objection::{ARRIVAL, SIGNAL_TO_NOISE, TakeObjection, find_implausible};
 use crate::run::recorder::LogLevel;
 use crate::run::recording_mode::RecordingMode;
@@ -40,11 +40,13 @@ enum ResponseState {
     Missing,
 }
 
-/// Assessment of a take, with the objections to it.
+/// Assessment of a pair's first take, with the objections to all.
 struct Judged {
     assessment: TakeAssessment,
     response: ResponseState,
     objections: Vec<TakeObjection>,
+    /// How far the second take differs, if there is one.
+    repeat: Option<RepeatDifference>,
 }
 
 impl RunController<'_> {
@@ -68,9 +70,9 @@ impl RunController<'_> {
         };
         // The drives hum; the arms hold by their brakes while the sweep is recorded.
         self.devices.robots.switch_drives(DrivePower::Off)?;
-        self.make_take(run)?;
+        self.make_takes(run)?;
         let reading = self.read_ambient()?;
-        let Judged { assessment, response, objections } = self.judge_take(microphone, speaker, &reading);
+        let Judged { assessment, response, objections, repeat } = self.judge_takes(microphone, speaker, &reading);
         let verdict = match (objections.is_empty(), is_last) {
             (true, _) => Verdict::Accepted,
             (false, false) => Verdict::Repeated,
@@ -82,6 +84,7 @@ impl RunController<'_> {
             loopback_level_dbfs: assessment.loopback_dbfs,
             arrival_error_us: assessment.arrival_error_us,
             clock_ratio_ppm: Some(assessment.analysis.clock_ratio_ppm).filter(|ppm| ppm.is_finite()),
+            repeat_difference_db: repeat.map(|found| found.difference_db).filter(|db| db.is_finite()),
             microphone_residual_mm: direct_mm(microphone, reached.microphone_mm),
             speaker_residual_mm: direct_mm(speaker, reached.speaker_mm),
             ..verdict_on(pair, number, verdict, &objections, &reading)
@@ -96,9 +99,11 @@ impl RunController<'_> {
         self.devices.robots.switch_drives(DrivePower::On)?;
         self.devices.robots.move_to(microphone, speaker)?;
         self.devices.robots.switch_drives(DrivePower::Off)?;
-        self.devices.audio.play_and_record(&self.output, &mut self.take)?;
+        for take in [&mut self.take, &mut self.repeat].into_iter().take(self.rig.sweep.repeat.into()) {
+            self.devices.audio.play_and_record(&self.output, take)?;
+        }
         let reading = self.read_ambient()?;
-        let judged = self.judge_take(microphone, speaker, &reading);
+        let judged = self.judge_takes(microphone, speaker, &reading);
         Ok((judged.assessment, judged.objections))
     }
 
@@ -108,12 +113,15 @@ impl RunController<'_> {
     }
 
     // An interface that lost samples is retried: nothing of that take is kept.
-    fn make_take(&mut self, run: &mut RunProgress<'_>) -> Result<(), Error> {
+    fn make_takes(&mut self, run: &mut RunProgress<'_>) -> Result<(), Error> {
         let mut lost = Vec::new();
-        let taken = retry_device(|| {
-            let taken = self.devices.audio.play_and_record(&self.output, &mut self.take);
-            lost.extend(taken.as_ref().err().map(ToString::to_string));
-            taken
+        let mut takes = [&mut self.take, &mut self.repeat].into_iter().take(self.rig.sweep.repeat.into());
+        let taken = takes.try_for_each(|take| {
+            retry_device(|| {
+                let taken = self.devices.audio.play_and_record(&self.output, take);
+                lost.extend(taken.as_ref().err().map(ToString::to_string));
+                taken
+            })
         });
         for what in lost {
             run.say(LogLevel::Warning, &format!("a take was lost, and made again: {what}"))?;
@@ -147,7 +155,7 @@ impl RunController<'_> {
         })
     }
 
-    fn judge_take(&mut self, microphone: [f64; 3], speaker: [f64; 3], reading: &AmbientReading) -> Judged {
+    fn judge_takes(&mut self, microphone: [f64; 3], speaker: [f64; 3], reading: &AmbientReading) -> Judged {
         let mut clipped = to_fractions(&self.take.microphone, &mut self.microphone);
         clipped += to_fractions(&self.take.loopback, &mut self.loopback);
         let reference = ReferenceAir::from_response(&self.rig.impulse_response);
@@ -158,13 +166,47 @@ impl RunController<'_> {
                 let mut objections = assessment.find_objections(&self.rig.validation, reading.outside_level_db);
                 objections.extend(find_unknowns(&assessment, reading));
                 objections.extend(find_implausible(reading));
-                Judged { assessment, response: ResponseState::Deconvolved, objections }
+                let repeat = self.judge_repeat(arrival, reading, &mut objections);
+                Judged { assessment, response: ResponseState::Deconvolved, objections, repeat }
             }
             Err(cause) => {
                 let objections = vec![TakeObjection::Broken { reason: cause.to_string() }];
-                Judged { assessment: unknown_assessment(clipped), response: ResponseState::Missing, objections }
+                let assessment = unknown_assessment(clipped);
+                Judged { assessment, response: ResponseState::Missing, objections, repeat: None }
             }
         }
+    }
+
+    // The second take must be as good as the first, and the same. What is wrong with both is said once.
+    fn judge_repeat(
+        &mut self,
+        arrival_secs: f64,
+        reading: &AmbientReading,
+        objections: &mut Vec<TakeObjection>,
+    ) -> Option<RepeatDifference> {
+        if self.rig.sweep.repeat < 2 {
+            return None;
+        }
+        self.first_response.clear();
+        self.first_response.extend_from_slice(self.assessor.response());
+        let mut clipped = to_fractions(&self.repeat.microphone, &mut self.microphone);
+        clipped += to_fractions(&self.repeat.loopback, &mut self.loopback);
+        let found = match self.assessor.assess_take([&self.microphone, &self.loopback], None, arrival_secs, clipped) {
+            Ok(found) => found,
+            Err(cause) => {
+                objections.push(TakeObjection::Broken { reason: format!("second take: {cause}") });
+                return None;
+            }
+        };
+        let difference = self.assessor.compare_repeat(&self.first_response);
+        let of_second = found.find_objections(&self.rig.validation, reading.outside_level_db);
+        for objection in of_second.into_iter().chain(difference.find_objection()) {
+            let is_known = |known: &TakeObjection| std::mem::discriminant(known) == std::mem::discriminant(&objection);
+            if !objections.iter().any(is_known) {
+                objections.push(objection);
+            }
+        }
+        Some(difference)
     }
 
     fn deconvolve_and_assess(
@@ -207,20 +249,23 @@ impl RunController<'_> {
         let is_usable = made.reached.is_some() && Celsius::new(reading.temperature_c).is_ok();
         let air = measured_air(reading);
         if run.options.keep == RecordingMode::Sweeps && is_usable {
-            let recording = SweepRecording {
+            let recording_of = |take: &AudioTake| SweepRecording {
                 pair_id: m.pair_id,
                 attempt: m.attempt,
                 sample_rate_hz,
-                sample_count: self.take.microphone.len() as u32,
+                sample_count: take.microphone.len() as u32,
                 format: SampleFormat::S24Split.into(),
-                microphone: split_24(&self.take.microphone).into(),
-                loopback: split_24(&self.take.loopback).into(),
+                microphone: split_24(&take.microphone).into(),
+                loopback: split_24(&take.loopback).into(),
                 temperature_c: reading.temperature_c,
                 humidity_pct: Some(air.humidity_pct),
                 pressure_hpa: Some(air.pressure_hpa),
                 playing_clock_ppm: None,
             };
-            run.recorder.sweep(at, &recording)?;
+            run.recorder.sweep(at, &recording_of(&self.take))?;
+            if self.rig.sweep.repeat > 1 {
+                run.recorder.record_repeat(at, &recording_of(&self.repeat))?;
+            }
         }
         if made.response == ResponseState::Deconvolved && is_usable {
             let ir = ImpulseResponse {

@@ -35,6 +35,24 @@ impl AudioInterface for Faulty {
     }
 }
 
+/// An interface that clips in its second take.
+struct SecondFaulty(Box<dyn AudioInterface>, u32);
+
+impl AudioInterface for SecondFaulty {
+    fn rate_hz(&self) -> f64 {
+        self.0.rate_hz()
+    }
+
+    fn play_and_record(&mut self, output: &[f32], take: &mut AudioTake) -> Result<(), RigError> {
+        self.0.play_and_record(output, take)?;
+        self.1 += 1;
+        if self.1 == 2 {
+            take.microphone[100] = (1 << 23) - 1;
+        }
+        Ok(())
+    }
+}
+
 /// An interface at another rate.
 struct Slower(Box<dyn AudioInterface>);
 
@@ -176,6 +194,37 @@ fn good_takes_are_accepted_at_once() {
         }
         assert_eq!(run.all::<ImpulseResponse>(topics::IR).len(), 40);
     }
+}
+
+#[test]
+fn two_takes_that_differ_are_repeated() {
+    let mut rig = quick();
+    rig.sweep.repeat = 2;
+    let devices = simulated(&rig, SurfaceMaterial::CoatedPrint, 3);
+    let good = record(&rig, devices, 20, RecordingMode::Sweeps, usize::MAX);
+    assert_eq!(good.counts(), (20, 0, 20), "{:?}", good.verdicts());
+    let [first, second] = [topics::SWEEP, topics::SWEEP_REPEAT].map(|topic| good.all::<SweepRecording>(topic));
+    assert_eq!((first.len(), second.len()), (20, 20));
+    for (a, b) in first.iter().zip(&second) {
+        assert!(a.pair_id == b.pair_id && a.attempt == b.attempt && a.microphone != b.microphone, "{}", a.pair_id);
+    }
+    // Noise, and air that gets warmer meanwhile.
+    for v in good.verdicts() {
+        let difference_db = v.repeat_difference_db.expect("two takes");
+        assert!((-90.0..-50.0).contains(&difference_db), "{v:?}");
+    }
+    let gain: fn(&mut AudioTake) = |take| take.microphone.iter_mut().for_each(|x| *x = *x / 20 * 19);
+    let run = run_of(&rig, faulty(&rig, gain, 1), 1);
+    let verdicts = run.verdicts();
+    assert_eq!(run.counts(), (1, 0, 2), "{verdicts:?}");
+    // 20 log10 of a twentieth.
+    assert!(verdicts[0].reasons[0].starts_with("two takes differ by -2"), "{verdicts:?}");
+    assert!((verdicts[0].repeat_difference_db.expect("two takes") + 26.0).abs() < 2.0, "{verdicts:?}");
+    // What is wrong with the second take alone counts, too.
+    let mut devices = simulated(&rig, SurfaceMaterial::CoatedPrint, 3);
+    devices.audio = Box::new(SecondFaulty(devices.audio, 0));
+    let run = run_of(&rig, devices, 1);
+    assert!(run.verdicts()[0].reasons.contains(&"1 samples clipped".to_owned()), "{:?}", run.verdicts());
 }
 
 fn check(fault: fn(&mut AudioTake), takes: u32, expected: &str) {

@@ -93,5 +93,5 @@ impl Tap for LiveTap {
 }
 
 fn is_light(topic: &str) -> bool {
-    !matches!(topic, topics::SWEEP | topics::SWEEP_AUDIO)
+    !matches!(topic, topics::SWEEP | topics::SWEEP_REPEAT | topics::SWEEP_AUDIO)
 }

@@ -27,13 +27,15 @@ pub(super) struct Channels {
     pub environment: u16,
     pub measurement: u16,
     pub log: u16,
+    /// Of second takes, once there is one.
+    pub repeat: Option<u16>,
 }
 
 impl Channels {
     /// Which chunks a channel's messages go to.
     pub fn chunk_lane(&self, channel: u16) -> ChunkLane {
         match channel {
-            c if c == self.sweep || c == self.audio => ChunkLane::Sweeps,
+            c if c == self.sweep || c == self.audio || Some(c) == self.repeat => ChunkLane::Sweeps,
             c if c == self.ir => ChunkLane::Responses,
             _ => ChunkLane::Light,
         }
@@ -72,8 +74,14 @@ impl Channels {
             environment: own_channel::<AmbientSample>(writer, topics::ENVIRONMENT)?,
             measurement: own_channel::<Measurement>(writer, topics::MEASUREMENT)?,
             log: foxglove_channel::<fg::Log>(writer, topics::LOG)?,
+            repeat: None,
         })
     }
+}
+
+/// Declares the topic of second takes, which few runs have.
+pub(super) fn register_repeats(writer: &mut Writer<impl Write + Seek>) -> McapResult<u16> {
+    own_channel::<SweepRecording>(writer, topics::SWEEP_REPEAT)
 }
 
 /// Returns the channels that every run of this version has, by the ids that they have in each.

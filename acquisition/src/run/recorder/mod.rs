@@ -297,6 +297,17 @@ impl Recorder {
         self.end_large(ChunkLane::Sweeps)
     }
 
+    /// Records the second take of a sweep.
+    pub fn record_repeat(&mut self, at: Timestamp, recording: &SweepRecording) -> Result<(), Error> {
+        let channel = match self.channels.repeat {
+            Some(channel) => channel,
+            None => channels::register_repeats(&mut self.writer.mcap).map_err(|e| self.failed(system_cause(e)))?,
+        };
+        self.channels.repeat = Some(channel);
+        self.own(channel, at, recording)?;
+        self.end_large(ChunkLane::Sweeps)
+    }
+
     /// Records an impulse response.
     pub fn ir(&mut self, at: Timestamp, ir: &ImpulseResponse) -> Result<(), Error> {
         self.own(self.channels.ir, at, ir)?;
