@@ -76,8 +76,8 @@ pub struct TakeAnalysis {
     /// and of the recording against the loopback if that is a digital copy of the sweep.
     /// NaN if neither shows the sweep.
     pub clock_ratio_ppm: f64,
-    /// The same of the loopback, which is a digital copy of the sweep, against the recording, if it can be distinguished
-    /// from dispersion: the recording is to be stretched by it.
+    /// The same of the loopback, which is a digital copy of the sweep, against the recording, if it can be
+    /// distinguished from dispersion: the recording is to be stretched by it.
     pub recording_clock_ppm: Option<f64>,
     /// Distortion of the recording by order; None if the sweep is linear, or not in the recording.
     pub distortion: Option<TakeDistortion>,

@@ -230,7 +230,8 @@ fn derivation(criterion: &mut Criterion) {
     group.bench_function(BenchmarkId::new("sensitivities", IR_LEN), |bencher| {
         let TransformedResponse { spectrum, .. } = &transformed;
         bencher.iter(|| {
-            plan.compute_sensitivities(black_box(spectrum), spectrum, |_| EnergyChanges::default(), &mut sensitivities, &mut scratch)
+            let by_air = |_| EnergyChanges::default();
+            plan.compute_sensitivities(black_box(spectrum), spectrum, by_air, &mut sensitivities, &mut scratch)
         });
     });
     let mut residual = ResidualFit::<f32>::new(IR_LEN, RATE_HZ, [LOW_HZ, HIGH_HZ]).expect("settings of the paper");

@@ -54,7 +54,7 @@ pub struct RepeatDifference {
     pub difference_db: f64,
     /// The noise in it, likewise.
     pub noise_db: f64,
-    /// What the noise does not explain, likewise; negative infinity if it explains all.
+    /// The part that noise does not explain, likewise; negative infinity if it explains all.
     pub unexplained_db: f64,
 }
 

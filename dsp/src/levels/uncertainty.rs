@@ -120,7 +120,7 @@ pub struct EnergySensitivity {
     pub correction: f64,
 }
 
-/// What the correction for the air leaves uncertain of the energy of a bin.
+/// Changes of the energy of a bin that its correction for the air leaves uncertain.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct EnergyChanges {
     /// Relative change per kelvin that the air is warmer.
@@ -211,8 +211,10 @@ impl<T: RealSample> ResidualFit<T> {
         if reflected_secs - direct_secs < LEAST_SEPARATION_SECS || !(direct_secs + reflected_secs).is_finite() {
             return Ok(waveform);
         }
-        let gates: Vec<f64> =
-            (0..self.len).map(|n| self.gate(n, reflected_secs)).take_while(|gate| *gate > 0.0).collect();
+        let gates: Vec<f64> = (0..self.len)
+            .map(|n| gate_gain(n as f64 / self.rate_hz - reflected_secs, GATE_SECS))
+            .take_while(|gate| *gate > 0.0)
+            .collect();
         let len = self.len;
         let direct = self.filter_spectrum(spectrum, |_| Complex::new(1.0, 0.0))?.to_vec();
         let derivative = self.filter_spectrum(spectrum, |bin| Complex::new(0.0, bin_angle(bin, len)))?;
@@ -268,16 +270,6 @@ impl<T: RealSample> ResidualFit<T> {
         })
     }
 
-    // 1 before the reflection, and 0 once it may arrive.
-    fn gate(&self, sample: usize, reflected_secs: f64) -> f64 {
-        let secs = sample as f64 / self.rate_hz - (reflected_secs - GATE_SECS[0]);
-        match secs / (GATE_SECS[0] - GATE_SECS[1]) {
-            ..=0.0 => 1.0,
-            fall @ 0.0..1.0 => 0.5 + 0.5 * (std::f64::consts::PI * fall).cos(),
-            _ => 0.0,
-        }
-    }
-
     // The signal of a spectrum within the sweep's range, times a factor of each bin.
     fn filter_spectrum(
         &mut self,
@@ -301,6 +293,16 @@ impl<T: RealSample> ResidualFit<T> {
         }
         let done = self.inverse.process_with_scratch(&mut self.filtered, &mut self.signal, &mut self.work);
         done.map(|()| &self.signal[..]).map_err(|_| not_finite)
+    }
+}
+
+/// Returns the gain so many seconds after a reflection's arrival that falls over half a cosine from 1 to 0 between two
+/// times before it, s.
+pub(crate) fn gate_gain(secs: f64, [from, to]: [f64; 2]) -> f64 {
+    match (secs + from) / (from - to) {
+        ..=0.0 => 1.0,
+        fall @ 0.0..1.0 => 0.5 + 0.5 * (std::f64::consts::PI * fall).cos(),
+        _ => 0.0,
     }
 }
 

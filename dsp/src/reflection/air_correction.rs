@@ -14,14 +14,14 @@ use crate::air::{AirAbsorption, AirState};
 use crate::error::check_len;
 use crate::foam::subtract_foam;
 use crate::temperature::ReferenceAir;
-use crate::uncertainty::{EnergyChanges, LEAST_PAIRS};
+use crate::uncertainty::{EnergyChanges, LEAST_PAIRS, gate_gain};
 use crate::{Error, RealSample};
 
 /// Natural logarithm of an amplitude ratio per dB.
 const NEPER_PER_DB: f64 = LN_10 / 20.0;
 
 /// Standard uncertainty of the slope of reflected sound, d ln(amplitude) / d ln(frequency), and the frequency, Hz, from
-/// which on it is so great; below, it rises with frequency. A relief's sound leaves the speaker in other directions than
+/// where it is so great; below, it rises with frequency. A relief's sound leaves the speaker in other directions than
 /// Flat's, of which the slope is learned. By errors of three panels in runs of the simulated rig at 18 to 25 C
 /// (`tests/numbers/repeated_runs.py`).
 const SLOPE_UNCERTAINTY: f64 = 0.4;
@@ -63,17 +63,16 @@ pub struct AirCorrectionFit<T: RealSample> {
     range_hz: [f64; 2],
     reference: ReferenceAir,
     forward: Arc<dyn RealToComplex<T>>,
-    pairs: usize,
     direct: PathSum,
     reflected: PathSum,
     /// The part of the direct sound before the reflection, of the pairs that have one, and the sum of its times, s.
     gated: PathSum,
-    gated_pairs: usize,
     separation_secs: f64,
 }
 
-/// Sum of aligned spectra, `[len / 2 + 1]`, and of the lengths of their paths, m.
+/// Sum of pairs' aligned spectra, `[len / 2 + 1]`, and of the lengths of their paths, m.
 struct PathSum {
+    pairs: usize,
     spectrum: Vec<Complex<f64>>,
     metres: f64,
 }
@@ -82,21 +81,9 @@ impl<T: RealSample> AirCorrectionFit<T> {
     /// Begins with responses of `len` samples to sweeps of this range, Hz.
     pub fn new(len: usize, rate_hz: f64, range_hz: [f64; 2], reference: ReferenceAir) -> Self {
         let [direct, reflected, gated] =
-            [(); 3].map(|()| PathSum { spectrum: vec![Complex::default(); len / 2 + 1], metres: 0.0 });
+            [(); 3].map(|()| PathSum { pairs: 0, spectrum: vec![Complex::default(); len / 2 + 1], metres: 0.0 });
         let forward = T::plan_real_forward(len);
-        Self {
-            rate_hz,
-            len,
-            range_hz,
-            reference,
-            forward,
-            pairs: 0,
-            direct,
-            reflected,
-            gated,
-            gated_pairs: 0,
-            separation_secs: 0.0,
-        }
+        Self { rate_hz, len, range_hz, reference, forward, direct, reflected, gated, separation_secs: 0.0 }
     }
 
     /// Adds a pair: its direct sound and what Flat reflects, `[len]`, and the lengths of both paths, m.
@@ -110,9 +97,10 @@ impl<T: RealSample> AirCorrectionFit<T> {
         let before: Vec<T> = if separation_secs < LEAST_SEPARATION_SECS {
             Vec::new()
         } else {
-            self.gated_pairs += 1;
             self.separation_secs += separation_secs;
-            let gate = |(n, x): (usize, &T)| T::of(x.f64() * self.gate(n, reflected_m / sound_m_s));
+            let gate = |(n, x): (usize, &T)| {
+                T::of(x.f64() * gate_gain(n as f64 / self.rate_hz - reflected_m / sound_m_s, GATE_SECS))
+            };
             direct.iter().enumerate().map(gate).collect()
         };
         let mut signal = self.forward.make_input_vec();
@@ -133,16 +121,9 @@ impl<T: RealSample> AirCorrectionFit<T> {
                 *sum += Complex::new(x.re.f64(), x.im.f64()) * Complex::from_polar(metres, turn * bin as f64);
             }
             sum.metres += metres;
+            sum.pairs += 1;
         }
-        self.pairs += 1;
         Ok(())
-    }
-
-    // 1 before the reflection, and 0 once it may arrive.
-    fn gate(&self, sample: usize, reflected_secs: f64) -> f64 {
-        let secs = sample as f64 / self.rate_hz - (reflected_secs - GATE_SECS[0]);
-        let fall = (secs / (GATE_SECS[0] - GATE_SECS[1])).clamp(0.0, 1.0);
-        0.5 + 0.5 * (std::f64::consts::PI * fall).cos()
     }
 
     /// Plans the correction.
@@ -159,19 +140,17 @@ impl<T: RealSample> AirCorrectionFit<T> {
             nepers
         };
         let absorption = by_bin(&own);
-        let smoothed = |path: &PathSum, pairs: usize| {
-            smoothed_slopes(&emitted_spectrum(path, pairs, &absorption), step_hz, self.range_hz)
-        };
-        let slopes = |path: &PathSum| match self.pairs >= LEAST_PAIRS {
-            true => exact_slopes(&emitted_spectrum(path, self.pairs, &absorption), step_hz, self.range_hz),
-            false => smoothed(path, self.pairs),
+        let smoothed = |path: &PathSum| smoothed_slopes(&path.emitted_spectrum(&absorption), step_hz, self.range_hz);
+        let slopes = |path: &PathSum| match path.pairs >= LEAST_PAIRS {
+            true => exact_slopes(&path.emitted_spectrum(&absorption), step_hz, self.range_hz),
+            false => smoothed(path),
         };
         let reflected_slopes = slopes(&self.reflected);
         let mut direct_slopes = slopes(&self.direct);
-        if self.gated_pairs >= LEAST_PAIRS {
-            let separation_secs = self.separation_secs / self.gated_pairs as f64;
+        if self.gated.pairs >= LEAST_PAIRS {
+            let separation_secs = self.separation_secs / self.gated.pairs as f64;
             let from_hz = GATED_HZ.max(GATED_PERIODS / separation_secs);
-            let gated = smoothed(&self.gated, self.gated_pairs);
+            let gated = smoothed(&self.gated);
             for ((bin, slope), gated) in direct_slopes.iter_mut().enumerate().zip(gated) {
                 let share = ((bin as f64 * step_hz / from_hz - 1.0) * 3.0).clamp(0.0, 1.0);
                 *slope = *slope * (1.0 - share) + gated * share;
@@ -463,10 +442,12 @@ fn transform<T: RealSample>(
     if is_finite { Ok(()) } else { Err(Error::NotFinite { what: "the response" }) }
 }
 
-// What speaker and microphone do to the sound of a path, without absorption by the reference air.
-fn emitted_spectrum(path: &PathSum, pairs: usize, absorption: &[f64]) -> Vec<Complex<f64>> {
-    let metres = path.metres / pairs.max(1) as f64;
-    path.spectrum.iter().zip(absorption).map(|(x, nepers)| x * (metres * nepers).exp()).collect()
+impl PathSum {
+    // Speaker and microphone alone, without absorption by the reference air.
+    fn emitted_spectrum(&self, absorption: &[f64]) -> Vec<Complex<f64>> {
+        let metres = self.metres / self.pairs.max(1) as f64;
+        self.spectrum.iter().zip(absorption).map(|(x, nepers)| x * (metres * nepers).exp()).collect()
+    }
 }
 
 // The first and the last bin whose neighbours are within the range that the sweep has, and no part of its tapers.

@@ -73,7 +73,7 @@ impl FoundPanel {
         self.has_steep_facets && self.detail_phases[band].is_some_and(|phase| phase <= TRUSTED_PHASE)
     }
 
-    fn mean_error_db(&self, band: usize) -> f64 {
+    fn level_uncertainty_db(&self, band: usize) -> f64 {
         mean_level_u_db(self.detail_phases[band].filter(|_| self.has_steep_facets))
     }
 
@@ -84,7 +84,7 @@ impl FoundPanel {
             target: goal.value,
             found: goal.figure_of(&self.figures.bands),
             deviation: goal.figure_deviation(&self.figures.bands),
-            simulation_error_db: (goal.kind == FigureKind::Level).then(|| self.mean_error_db(goal.band)),
+            simulation_error_db: (goal.kind == FigureKind::Level).then(|| self.level_uncertainty_db(goal.band)),
             is_trusted: self.is_trusted(goal.band),
         };
         let band_row = |(band, figures): (usize, &echolake_acquisition::design::BandFigures)| {
@@ -95,7 +95,7 @@ impl FoundPanel {
                 "scattering": figures.scattering.value,
                 "scattering_u": figures.scattering.uncertainty,
                 "detail_phase": self.detail_phases[band],
-                "simulation_error_db": self.mean_error_db(band),
+                "simulation_error_db": self.level_uncertainty_db(band),
                 "is_trusted": self.is_trusted(band),
             })
         };
@@ -182,7 +182,7 @@ pub(super) fn write_panel(
     }
     let mut bands = band_labels(rig);
     bands.truncate(levels_db.len());
-    let errors: Vec<_> = (0..bands.len()).map(|band| panel.mean_error_db(band).to_string()).collect();
+    let errors: Vec<_> = (0..bands.len()).map(|band| panel.level_uncertainty_db(band).to_string()).collect();
     let title = format!("{name}; error of the bands' means: {} dB", errors.join(", "));
     let figure = GridFigure {
         bands,

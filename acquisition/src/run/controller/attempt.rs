@@ -45,7 +45,7 @@ struct Judged {
     assessment: TakeAssessment,
     response: ResponseState,
     objections: Vec<TakeObjection>,
-    /// How far the second take differs, if there is one.
+    /// Difference of the second take, if there is one.
     repeat: Option<RepeatDifference>,
 }
 
