@@ -4,6 +4,7 @@
 use std::hint::black_box;
 
 use criterion::{BenchmarkId, Criterion, Throughput, criterion_group, criterion_main};
+use echolake_dsp::air::AirState;
 use echolake_dsp::air_correction::{AirCorrectionFit, PairAir, TransformedResponse};
 use echolake_dsp::chain::{DerivationPlan, MeasurementParams, MeasurementPlan, raw_len};
 use echolake_dsp::deconvolution::{DeconvolutionParams, DeconvolutionPlan, SpectralDivision, TransformLength};
@@ -14,11 +15,10 @@ use echolake_dsp::height_field::HeightField;
 use echolake_dsp::kirchhoff::{KirchhoffPlan, SoundPath, TransducerPose};
 use echolake_dsp::rounding::{CURVE_BITS, round_samples};
 use echolake_dsp::sweep::{SineSweep, SweepShape};
-use echolake_dsp::air::AirState;
 use echolake_dsp::temperature::{ReferenceAir, TemperatureCorrection};
 use echolake_dsp::uncertainty::{EnergyChanges, EnergySensitivity, ResidualFit};
-use echolake_schema::Rig;
 use echolake_dsp::{Error, RealSample as _};
+use echolake_schema::Rig;
 use echolake_schema::messages::SampleFormat;
 use echolake_schema::samples::{decode_samples, split_24};
 use rustfft::FftDirection;
@@ -48,8 +48,14 @@ criterion_main!(kernels);
 
 /// The sweep, and what a microphone hears of it 90 samples later.
 fn recordings() -> [Vec<f32>; 2] {
-    let sweep =
-        SineSweep { shape: SweepShape::Linear, rate_hz: RATE_HZ, duration_secs: 0.5, low_hz: LOW_HZ, high_hz: HIGH_HZ, fade_secs: 0.001 };
+    let sweep = SineSweep {
+        shape: SweepShape::Linear,
+        rate_hz: RATE_HZ,
+        duration_secs: 0.5,
+        low_hz: LOW_HZ,
+        high_hz: HIGH_HZ,
+        fade_secs: 0.001,
+    };
     let loopback: Vec<f32> = sweep.samples().into_iter().map(|x| x as f32).collect();
     let recording = (0..loopback.len()).map(|n| if n < 90 { 0.0 } else { 0.3 * loopback[n - 90] }).collect();
     [recording, loopback]
@@ -221,7 +227,9 @@ fn derivation(criterion: &mut Criterion) {
     let mut group = criterion.benchmark_group("derivation");
     group.throughput(Throughput::Elements(IR_LEN as u64));
     group.bench_function(BenchmarkId::new("response_to_curves", IR_LEN), |bencher| {
-        bencher.iter(|| -> Result<(), Error> { plan.derive_response(black_box(&ir), &foam, &ir, &mut derived, &mut scratch) });
+        bencher.iter(|| -> Result<(), Error> {
+            plan.derive_response(black_box(&ir), &foam, &ir, &mut derived, &mut scratch)
+        });
     });
     group.bench_function(BenchmarkId::new("with_known_flat", IR_LEN), |bencher| {
         bencher.iter(|| plan.run_over(black_box(&transformed), &energies, &mut derived, &mut scratch));
